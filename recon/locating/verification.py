@@ -215,13 +215,13 @@ def choose_lens(
     """
     side = judged.side
     starts = _refine_starts(judged, cameras)
-    best = _choose_start(starts)
-    if best is None:
+    if not starts:
         return None
+    best = _choose_start(starts)
     if _sigmas(best.wide)[0] > _VAGUE:
         between = [replace(best.camera.lens, focal=best.camera.lens.focal * math.exp(step)) for step in _BETWEEN]
         starts += _refine_starts(judged, search_cameras_longer(judged, between))
-        best = _choose_start(starts) or best
+        best = _choose_start(starts)
     camera, wide = best.camera, best.wide
     shaped, usual = _test_shape(
         wide, _nearest(assumed, wide) or pose_refinement.make_typical_lens(camera.lens, side), side
@@ -262,14 +262,12 @@ def _refine_starts(judged: QueryContext, cameras: Sequence[CameraModel]) -> list
     return [_Start(camera, wide) for camera, wide in found if wide is not None]
 
 
-def _choose_start(starts: Sequence[_Start]) -> _Start | None:
+def _choose_start(starts: Sequence[_Start]) -> _Start:
     """Chooses the start on which most correspondences agree; a vague one gives way to the best determined of equals.
 
     Where only far points agree, they leave focal length and position open along a line; those on which near ones agree,
     too, are another set of as many points.
     """
-    if not starts:
-        return None
     best = starts[0]
     for start in starts[1:]:
         if start.count > _CLEARLY_MORE * best.count:

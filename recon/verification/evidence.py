@@ -404,7 +404,7 @@ class Evidence:
 
 
 # Pieces that were moved as wholes, as those of a montage: two of them, shifted by different lengths, look like two
-# walls that face the camera, and a camera beside it fits. A third image contradicts that.
+# walls that face the camera, and a camera beside it fits. Of more than two images only registration may notice it.
 
 MAX_PIECES = 3
 PIECE_PX = 0.5  # largest difference of a piece's shifts, pixels at REFERENCE_SIDE
@@ -423,8 +423,7 @@ def measure_shifted_share(keyframes: Sequence[Keyframe], registration: Registrat
     for camera in registration.cameras:
         (mine,) = np.nonzero(registration.observed_by == camera.index)
         scale = longer_side(keyframes[camera.index].frame) / REFERENCE_SIDE
-        order = np.argsort(registration.observed_point[mine], kind="stable")
-        seen.append((registration.observed_point[mine][order], registration.observed_pixels[mine][order] / scale))
+        seen.append((registration.observed_point[mine], registration.observed_pixels[mine] / scale))
     (points, pixels), (others, other_pixels) = seen
     _, first, second = np.intersect1d(points, others, return_indices=True)
     shifts = left = other_pixels[second] - pixels[first]

@@ -108,9 +108,13 @@ def window(place: TrialScene, count: int, draw: int = 0) -> list[TrialImage]:
         starts = list(range(len(place.names) - stride * (count - 1)))
     if not starts:
         return []
-    generator = np.random.default_rng([count, zlib.crc32(place.name.encode()), *([draw] if draw else [])])
-    start = int(generator.choice(starts))
+    start = int(make_generator(count, place.name, draw).choice(starts))
     return place.load_images([start + stride * index for index in range(count)])
+
+
+def make_generator(count: int, text: str, draw: int) -> np.random.Generator:
+    """Returns the source of random numbers for a number of images, a text and a draw."""
+    return np.random.default_rng([count, zlib.crc32(text.encode()), *([draw] if draw else [])])
 
 
 def run_trial(
@@ -187,8 +191,7 @@ def run_scene(
         caches: dict[str, dict[PieceKey, bytes]] = defaultdict(dict)
         for setting in settings:
             possible = [name for name in kinds if setting in KINDS[name].settings and name != "clean"]
-            seeds = [count, zlib.crc32(f"{place.name} {setting}".encode()), *([draw] if draw else [])]
-            drawn = np.random.default_rng(seeds).permutation(possible)
+            drawn = make_generator(count, f"{place.name} {setting}", draw).permutation(possible)
             for name in [*(["clean"] if "clean" in kinds else []), *drawn[:sample].tolist()]:
                 cache = caches["given" if setting == "given" else "centred"]
                 trial = run_trial(photos, KINDS[name], setting, cache, config)
