@@ -253,7 +253,7 @@ def check_moving_plane(case: EvidenceCase) -> Verdict | None:
 
 
 def check_montage(case: EvidenceCase) -> Verdict | None:
-    """Rejects two cameras whose common points moved in a few pieces, as wholes."""
+    """Rejects cameras of which any two have common points that moved in a few pieces, as wholes."""
     share = case.evidence.shifted_share
     if share <= case.config.max_shifted_share:
         return None
