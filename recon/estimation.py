@@ -26,6 +26,7 @@ from splatnode.recon.keyframes import (
 )
 from splatnode.recon.locating.localize import collect_landmarks, measure_shears
 from splatnode.recon.matching import features
+from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.matching.view_graph import Pair, ViewGraph
 from splatnode.recon.metric.depth_alignment import place_beside, place_by_depth
 from splatnode.recon.metric.depth_fit import fit_depth_images, make_depth_views
@@ -35,7 +36,7 @@ from splatnode.recon.rasterize import choose_device, format_device
 from splatnode.recon.registration import registration as registration_registration
 from splatnode.recon.registration.known_poses import GivenWorld, Offset
 from splatnode.recon.registration.mapping_problem import compute_pooled_ratio
-from splatnode.recon.registration.posed_mapping import TELLING_MATCHES, offset_of, register_posed
+from splatnode.recon.registration.posed_mapping import find_telling_pairs, offset_of, register_posed
 from splatnode.recon.registration.registration import Registration, register, undistort_keyframes
 from splatnode.recon.registration.rigs import RigEstimate
 from splatnode.recon.result.snapshot import DepthCode, Landmarks
@@ -481,11 +482,31 @@ def _hold_by_depth(
     if found is None or found.given is None:
         return None
     given = replace(found.given, from_depth=True, scale_sigma=float(np.hypot(found.given.scale_sigma, scale_sigma)))
-    registration = replace(found, given=given)
+    registration = _drop_doubtful_points(replace(found, given=given), graph.pairs)
     verdict = decide_posed(graph, registration, given, config.decision)
     posed = Reconstruction(graph, registration, None, verdict)
-    is_refuted = _is_contradicted(posed, find_telling_pairs(graph)) or _points_contradict_depth(posed)
+    is_refuted = _is_contradicted(posed, find_telling_pairs(graph.pairs)) or _points_contradict_depth(posed)
     return None if is_refuted else posed
+
+
+def _drop_doubtful_points(registration: Registration, pairs: Mapping[Pair, TwoView]) -> Registration:
+    """Returns the registration without the points that no pair of many matches shows.
+
+    Between plain walls, few matches are often wrong; cameras that depth images place cannot tell.
+    """
+    observed, seen_by = registration.observed_point, registration.observed_by
+    shown = np.zeros(len(registration.points), bool)
+    for pair in find_telling_pairs(pairs):
+        first, second = (observed[seen_by == index] for index in pair)
+        shown[np.intersect1d(first, second)] = True
+    kept = shown[observed]
+    return replace(
+        registration,
+        points=registration.points[shown],
+        observed_by=seen_by[kept],
+        observed_point=(np.cumsum(shown) - 1)[observed[kept]],
+        observed_pixels=registration.observed_pixels[kept],
+    )
 
 
 def _points_contradict_depth(posed: Reconstruction) -> bool:
@@ -494,11 +515,6 @@ def _points_contradict_depth(posed: Reconstruction) -> bool:
         return False
     fits = fit_depth_images(make_depth_views(posed.graph, posed.registration))
     return any(fit.check.code is DepthCode.CONTRADICTS for fit in fits)
-
-
-def find_telling_pairs(graph: ViewGraph) -> set[Pair]:
-    """The pairs of so many matches that they may contradict depth images: edges of plain walls give wrong ones, too."""
-    return {pair for pair, found in graph.pairs.items() if len(found.matches) >= TELLING_MATCHES}
 
 
 def _is_contradicted(posed: Reconstruction, by: Collection[Pair] | None = None) -> bool:

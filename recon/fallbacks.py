@@ -31,7 +31,6 @@ from splatnode.recon.estimation import (
     add_cameras_by_depth,
     estimate_cameras,
     estimate_cameras_by_depth,
-    find_telling_pairs,
 )
 from splatnode.recon.geometry import align_cameras, angles_deg
 from splatnode.recon.keyframes import PLAIN, Rejected
@@ -41,6 +40,7 @@ from splatnode.recon.networks import Weights, depth_anything, find_mismatch, loc
 from splatnode.recon.optimize.losses import semantic
 from splatnode.recon.priors import xfeat
 from splatnode.recon.registration.known_poses import has_calibrated_lens
+from splatnode.recon.registration.posed_mapping import find_telling_pairs
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.threads import BACKGROUND, RunContext
 
@@ -381,7 +381,7 @@ def _try_fallbacks(
 def _needs_depth(estimate: Reconstruction) -> bool:
     """Whether photographs show too little, where few matches at most speak against a lens."""
     code = estimate.verdict.code
-    return code in NEEDING_DEPTH or (code is Code.FOCAL_SUSPECT and not find_telling_pairs(estimate.graph))
+    return code in NEEDING_DEPTH or (code is Code.FOCAL_SUSPECT and not find_telling_pairs(estimate.graph.pairs))
 
 
 def _advise_lens(estimate: Reconstruction) -> Reconstruction:

@@ -15,7 +15,7 @@ from scipy.special import chdtrc, ndtri
 
 from splatnode.recon.geometry import align_cameras, angles_deg, compute_rms_radius, cross_matrix
 from splatnode.recon.keyframes import Keyframe
-from splatnode.recon.matching.pair_matching import TwoView
+from splatnode.recon.matching.pair_matching import Pair, TwoView
 from splatnode.recon.registration import (
     bundle_adjustment,
     incremental_mapper,
@@ -120,7 +120,7 @@ _DOUBTED_RATIO = 0.6  # share of a view's matches that fit, below which its pose
 _MORE, _MORE_POINTS = 1.5, 15  # factor and number by which more observations must fit another pose
 _LEAST_OBSERVATIONS = 15  # of points that two others see, of a camera that images alone place
 # A pair with so many matches tells whether a pose is false: most agree on another one, and few on what is given
-TELLING_MATCHES, _CONSISTENT, _AGREEING = 40, 0.8, 0.3
+_TELLING_MATCHES, _CONSISTENT, _AGREEING = 40, 0.8, 0.3
 # Far from what is given, repeated structure (the other wing of a castle) is likelier than such an error of a pose
 _FAR_DEG, _TELLING_FAR = 15.0, 150
 _ROUNDS = 3  # of tests after a model was finished
@@ -476,10 +476,10 @@ def _release_undecided_pairs(problem: MapperInput, partial: SparseModel, config:
 
 def _pairs_say(problem: MapperInput, partial: SparseModel, config: MapperConfig) -> dict[tuple[int, int], int]:
     """Judges pairs of held views: 1 where the matches agree with the poses, -1 where with others, else 0."""
-    held, found = set(_find_held_views(partial)), {}
+    held, telling, found = set(_find_held_views(partial)), find_telling_pairs(problem.pairs), {}
     limit = config.incremental.triangulation.max_error_px
     for (i, j), pair in problem.pairs.items():
-        if not {i, j} <= held or len(pair.matches) < TELLING_MATCHES:
+        if not {i, j} <= held or (i, j) not in telling:
             continue
         scale = float(problem.scale[i])
         share = float((multiview_geometry.sampson_errors(partial.estimate, (i, j), pair) < limit * scale).mean())
@@ -491,6 +491,14 @@ def _pairs_say(problem: MapperInput, partial: SparseModel, config: MapperConfig)
         apart_deg = float(angles_deg(rotation, given))
         found[i, j] = -int(contradicts_poses(len(pair.matches), num_fit, apart_deg))
     return found
+
+
+def find_telling_pairs(pairs: Mapping[Pair, TwoView]) -> set[Pair]:
+    """Finds the pairs of so many matches that they may contradict poses and depth images.
+
+    The edges of plain walls give matches, too, few and wrong ones.
+    """
+    return {pair for pair, found in pairs.items() if len(found.matches) >= _TELLING_MATCHES}
 
 
 def contradicts_poses(num_matches: int, num_fit: int, apart_deg: float) -> bool:

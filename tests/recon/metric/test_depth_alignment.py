@@ -14,6 +14,9 @@ from scipy.spatial.transform import Rotation
 from splatnode.capture.diorama import Solid, look_at
 from splatnode.capture.frame import Frame
 from splatnode.recon.config import preset
+from splatnode.recon.estimation import estimate_cameras_by_depth, prepare_all
+from splatnode.recon.matching.pair_matching import TwoView
+from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.metric.depth_alignment import (
     PlacedCamera,
     align_clouds,
@@ -200,6 +203,32 @@ def test_photographs_alone_are_refused_and_depth_gives_metres():
         assert abs(apart - expected) < 0.02
     assert all(camera.given is None for camera in metric.cameras)  # nobody gave a pose
     assert len(metric.gaussians) > 0
+
+
+@pytest.mark.parametrize(("count", "placed"), [(0, True), (35, True), (80, False)])
+def test_many_matches_may_contradict_the_depth_that_places_cameras_and_few_may_not(count, placed):
+    """Matches of points three times as near as the walls: the edges of plain walls give such ones, but not many."""
+    config, rng = preset("preview"), np.random.default_rng(5)
+    keyframes, _ = prepare_all(frames(), config)
+    (T, K), (T_other, K_other) = room().cameras[:2]
+    width, height = keyframes[0].frame.width, keyframes[0].frame.height
+    pixels = rng.uniform((0.3 * width, 0.3 * height), (0.7 * width, 0.7 * height), (count, 2))
+    rays = np.column_stack([(pixels - K[:2, 2]) / np.diag(K)[:2], np.ones(count)])
+    world = 0.8 * rays @ T[:3, :3].T + T[:3, 3]
+    seen = (world - T_other[:3, 3]) @ T_other[:3, :3] @ K_other.T
+    others = seen[:, :2] / seen[:, 2:]
+    shown = [
+        replace(keyframe, features=replace(keyframe.features, points=np.vstack([keyframe.features.points, points])))
+        for keyframe, points in zip(keyframes, (pixels, others, np.empty((0, 2))), strict=True)
+    ]
+    numbers = np.column_stack([len(keyframe.features.points) + np.arange(count) for keyframe in keyframes[:2]])
+    centred = (pixels - K[:2, 2], others - K_other[:2, 2])
+    pair = TwoView(numbers, *centred, count, -100.0, 0, 0, K[0, 0] / max(width, height))
+    graph = ViewGraph(config.matching, tuple(shown), {(0, 1): pair} if count else {})
+    found = estimate_cameras_by_depth(graph, config)
+    assert (found is not None and found.verdict.publishable) == placed
+    if found is not None and found.registration is not None:
+        assert len(found.registration.points) == 0
 
 
 @cache
