@@ -157,8 +157,9 @@ NO_OVERLAP = Refusal(
 )
 NO_PARALLAX = Refusal(
     Code.NO_PARALLAX,
-    "The camera only turned: {found}.",
-    "Step at least 20 cm to the side between photographs instead of turning on the spot.",
+    "The camera only turned, or moved along a flat wall: {found}.",
+    "Step at least 20 cm to the side between photographs instead of turning on the spot, and let things at several "
+    "distances into the picture.",
 )
 PLANAR = Refusal(
     Code.PLANAR_ONLY,
@@ -199,7 +200,8 @@ UNCERTAIN_FOCAL = Refusal(
     Code.FOCAL_SUSPECT,
     "The focal length is known to {focal:.0f} % only, which leaves the positions open to {centre:.0f} % of the "
     "distance to the scene and the directions to {rotation:.0f} degrees.",
-    "Give the camera's calibration, or add photographs that look at the scene from other directions.",
+    "Give the camera's calibration, or add photographs that look at the scene from other directions. Keep zoom and focus "
+    "as they are and do not crop.",
 )
 MIXED_CAMERAS = Refusal(
     Code.MIXED_CAMERAS,
