@@ -343,9 +343,9 @@ def _register_and_verify(graph: ViewGraph, config: ReconstructionConfig, run: Ru
     evidence = verify(graph, seen, config.verification, run)
     give_back_memory()
     verdict = explain_refusal(decide(graph, seen, evidence, config.decision), graph)
-    may_be_sheared = verdict.code in _OF_SHEARED and seen is not None and len(seen.cameras) > _MOST_ALIKE
-    shears = measure_shears(graph, seen) if seen is not None and (verdict.publishable or may_be_sheared) else {}
-    verdict = _name_sheared(verdict, shears) if may_be_sheared else verdict
+    suspects = frozenset() if seen is None else _find_shear_suspects(graph, seen, verdict)
+    shears = measure_shears(graph, seen) if seen is not None and (verdict.publishable or suspects) else {}
+    verdict = _name_sheared(verdict, shears, suspects)
     if registration is not None and registration.rig is not None:
         verdict = describe_rig(verdict, graph, registration.rig)
     kept = registration if verdict.publishable else seen
@@ -359,13 +359,28 @@ _MOST_SHEAR = 0.01  # by which an image that is named is sheared, and differs fr
 _LEAST_SHEAR = 0.003  # below, bounds allow for it
 
 
-def _name_sheared(verdict: Verdict, shears: Mapping[str, float]) -> Verdict:
-    """The refusal of the image that is sheared most, where it stands out, in place of what it looks like.
+def _find_shear_suspects(graph: ViewGraph, registration: Registration, verdict: Verdict) -> frozenset[str]:
+    """The images whose shear may explain the verdict: all of a refusal, those with a lens of their own of an answer.
+
+    Such a lens takes a shear up as a principal point far from the middle, and its camera aside.
+    """
+    cameras = registration.cameras
+    if len(cameras) <= _MOST_ALIKE or not (verdict.publishable or verdict.code in _OF_SHEARED):
+        return frozenset()
+    return frozenset(graph.names[each.index] for each in cameras if each.own_lens or not verdict.publishable)
+
+
+def _name_sheared(verdict: Verdict, shears: Mapping[str, float], suspects: Collection[str]) -> Verdict:
+    """The refusal of the suspect that is sheared most, where it stands out, in place of what it looks like.
 
     What all images have alike, as of one pan, does not count.
     """
     middle = float(np.median(list(shears.values()))) if shears else 0.0
-    found = [(name, shear) for name, shear in shears.items() if min(abs(shear), abs(shear - middle)) > _MOST_SHEAR]
+    found = [
+        (name, shear)
+        for name, shear in shears.items()
+        if name in suspects and min(abs(shear), abs(shear - middle)) > _MOST_SHEAR
+    ]
     if not found:
         return verdict
     name, shear = max(found, key=lambda each: abs(each[1]))

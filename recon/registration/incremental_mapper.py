@@ -369,7 +369,7 @@ _COARSE_PX, _COARSE_ROBUST_PX = 1.0, 4.0  # noise and scale of the robust loss o
 # them as well as each other, and nearly so
 _AS_WELL, _NEARLY = 0.97, 0.9
 # Difference of log focals from which on a lens is far from a typical one, and from what its pairs vote for
-_FAR_FROM_TYPICAL = 0.8
+_FAR_FROM_TYPICAL = 0.5
 _FAR_FROM_VOTE = 0.3
 _HELD_SIGMA = 0.15  # of log focal, while such a focal length is held
 _OTHER_ATTEMPTS = 3  # first pairs that are tried with it

@@ -200,8 +200,8 @@ UNCERTAIN_FOCAL = Refusal(
     Code.FOCAL_SUSPECT,
     "The focal length is known to {focal:.0f} % only, which leaves the positions open to {centre:.0f} % of the "
     "distance to the scene and the directions to {rotation:.0f} degrees.",
-    "Give the camera's calibration, or add photographs that look at the scene from other directions. Keep zoom and focus "
-    "as they are and do not crop.",
+    "Give the camera's calibration, or add photographs that look at the scene from other directions. Keep zoom and "
+    "focus as they are and do not crop.",
 )
 MIXED_CAMERAS = Refusal(
     Code.MIXED_CAMERAS,
