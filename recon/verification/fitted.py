@@ -60,7 +60,7 @@ FITTED = VerdictModels(
                 "directions": Term(typical=0.368, slope=-0.555),
                 "rotation_bound": Term(typical=-0.209, slope=-1.2),
                 "travel_bound": Term(typical=1.4, slope=-1.42),
-                "own_lens": Term(typical=0.0, slope=-1.53),
+                "own_lens": Term(typical=0.0, slope=-1.93),
             },
         ),
     ),

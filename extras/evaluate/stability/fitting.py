@@ -359,7 +359,7 @@ def fit_odds(samples: Sequence[Sample], claim_model: ErrorModel) -> OddsModel:
 
 def _compute_offset(doubted: Array) -> float:
     """Returns by how much log odds must be lowered for none of these to be published."""
-    return max(0.0, float(doubted.max()) + MARGIN) if len(doubted) else 0.0
+    return max(0.0, float(doubted.max()) + MARGIN - DecisionConfig().min_log_odds) if len(doubted) else 0.0
 
 
 def _fit_regression(table: Array, right: npt.NDArray[np.bool_]) -> OddsModel:
