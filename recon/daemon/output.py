@@ -47,6 +47,7 @@ from splatnode.recon.result import snapshot as result_snapshot
 from splatnode.recon.result.export import remove_result
 from splatnode.recon.result.report import write_result_folder
 from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.verdict import parse_frame_name
 
 log = logging.getLogger(__name__)
 
@@ -113,8 +114,10 @@ class Output:
         """`complain` is called where the disk is full: that costs a result, or time after a restart; no keyframe."""
         self._worlds = worlds or WorldRevisions()
         self._config, self._store, self._publish, self.complain = config, store, publish, complain
-        self.index = SubmapIndex(config.out, store.identity)
-        self._metres = MetricScaler(config.reconstruction.metric)
+        metric = config.reconstruction.metric
+        frame = None if metric.frame is None else parse_frame_name(metric.frame).value
+        self.index = SubmapIndex(config.out, store.identity, frame)
+        self._metres = MetricScaler(metric)
 
     def publish(self, snapshot: Snapshot, work: IncrementalReconstruction) -> Snapshot:
         """Shows what `work` has come to, in metres where these are known; what is shown."""

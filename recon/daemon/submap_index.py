@@ -136,27 +136,45 @@ class _Index(msgspec.Struct, frozen=True):
     submaps: tuple[SubmapRecord, ...] = msgspec.field(default=(), name="places")
     links: tuple[PoseGraphEdge, ...] = ()  # between scenes that are verified
     poses: tuple[SubmapPose, ...] = ()  # of these scenes, by all links together
+    frame: str | None = None  # of reference, that the node was asked for
+
+
+def _describe_frame(frame: str | None) -> str:
+    return f"the frame {frame}" if frame else "the default frame"
 
 
 class SubmapIndex:
     """The file, and what is in it."""
 
-    def __init__(self, out: Path, checkpoint: str) -> None:
+    def __init__(self, out: Path, checkpoint: str, frame: str | None = None) -> None:
         """Goes on with the submaps of an earlier process that had the same `checkpoint`.
 
-        An index that cannot be read begins anew.
+        An index that cannot be read begins anew. The log tells where that process was asked for another `frame` of
+        reference: files that are written from now on are in this one.
         """
-        self._path, self._index = out / FILE, _Index(checkpoint)
+        self._path, self._index = out / FILE, _Index(checkpoint, frame=frame)
         try:
             with guard_untrusted(SceneFileError):
                 found = record_in(read_json_file(self._path), _Index)
             if found.checkpoint == checkpoint:
                 self._index = found
+                self._change_frame(frame)
         except FileNotFoundError:
             pass
         except (OSError, SceneFileError) as error:
             raise_shortage(error)
             log.warning("the index of submaps begins anew: %s", error)
+
+    def _change_frame(self, frame: str | None) -> None:
+        before = self._index.frame
+        if frame == before:
+            return
+        if self._index.submaps:
+            log.warning(
+                "until now results were in %s; from now on they are in %s: give %s to keep them in one frame",
+                _describe_frame(before), _describe_frame(frame), f"--frame {before}" if before else "no --frame",
+            )  # fmt: skip
+        self._index = msgspec.structs.replace(self._index, frame=frame)
 
     def select_newest(self, most: int) -> Sequence[SubmapRecord]:
         """The submaps that were found last, at most so many."""

@@ -90,7 +90,7 @@ def test_each_raw_file_is_named_on_a_page():
 
 def test_each_trial_of_broken_lenses_is_judged_and_the_limits_say_how():
     keys, broken = ("scene", "count", "kind", "setting"), []
-    for name in ("lens_assumptions", "lens_assumptions_draws"):
+    for name in ("lens_assumptions", "lens_assumptions_draws", "lens_assumptions_later"):
         judged, trials = (raw.raw(each)["trials"] for each in (f"{name}_judged", name))
         assert [[each[key] for key in keys] for each in judged] == [[each[key] for key in keys] for each in trials]
         broken += [each for each in judged if each["kind"] != "clean"]

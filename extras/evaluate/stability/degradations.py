@@ -490,6 +490,60 @@ KINDS: Mapping[str, AssumptionBreak] = {
 }
 
 
+# Kinds that were made after all numbers were fitted, which no number is fitted to.
+
+_SHEARED = 0.05  # of the width, from the first row to the last: a camera that pans by 60 degrees a second
+
+
+def _crop_to_squares(photos: Sequence[TrialImage], rng: np.random.Generator) -> list[TrialImage]:
+    cropped = [perturbations.crop_to_square(photo, float(rng.uniform())) for photo in photos]
+    return [replace(photo, name=f"square_{photo.name}") for photo in cropped]
+
+
+def _crop_alike(photos: Sequence[TrialImage], rng: np.random.Generator) -> list[TrialImage]:
+    left, top = rng.uniform(size=2).tolist()
+    cropped = [perturbations.crop_image(photo, 0.75, left, top) for photo in photos]
+    return [replace(photo, name=f"cropped_{photo.name}") for photo in cropped]
+
+
+def _zoom_two(photos: Sequence[TrialImage], rng: np.random.Generator) -> list[TrialImage]:
+    chosen = rng.permutation(len(photos))[: max(2, len(photos) // 3)].tolist()
+    return [
+        zoom_image(photo, float(rng.uniform(1.1, 1.8))) if index in chosen else photo
+        for index, photo in enumerate(photos)
+    ]
+
+
+def _zoom_all(photos: Sequence[TrialImage], rng: np.random.Generator) -> list[TrialImage]:
+    return [zoom_image(photo, float(rng.uniform(1.0, 1.6))) for photo in photos]
+
+
+def _zoom_one_aside(photos: Sequence[TrialImage], rng: np.random.Generator) -> list[TrialImage]:
+    across, down = rng.uniform(-0.15, 0.15, 2).tolist()
+    return _change_one(photos, rng, lambda photo: zoom_image(photo, 1.5, across, down))
+
+
+def _shear_one(photos: Sequence[TrialImage], rng: np.random.Generator) -> list[TrialImage]:
+    def shear(photo: TrialImage) -> TrialImage:
+        return replace(perturbations.apply_rolling_shutter(photo, _SHEARED), name=f"sheared_{photo.name}")
+
+    return _change_one(photos, rng, shear)
+
+
+LATER_KINDS: Mapping[str, AssumptionBreak] = {
+    kind.name: kind
+    for kind in (
+        KINDS["clean"],
+        AssumptionBreak("squares", _crop_to_squares, ("nothing",)),
+        AssumptionBreak("all cropped alike", _crop_alike, ("nothing",)),
+        AssumptionBreak("a third zoomed", _zoom_two),
+        AssumptionBreak("each zoomed", _zoom_all),
+        AssumptionBreak("one zoomed 1.5, aside", _zoom_one_aside),
+        AssumptionBreak("one sheared", _shear_one),
+    )
+}
+
+
 def _make_row(kind: AssumptionBreak) -> MatrixRow:
     """Seeds take turns through the numbers of images and what is told."""
 

@@ -368,7 +368,19 @@ def crop_image(photo: TrialImage, share: float, left: float, top: float) -> Tria
     """`share` of the width and height; `left` and `top` in [0, 1] say where between the two edges."""
     height, width = photo.image.shape[:2]
     x, y = round(left * (1 - share) * width), round(top * (1 - share) * height)
-    image = np.ascontiguousarray(photo.image[y : y + round(share * height), x : x + round(share * width)])
+    return crop_rectangle(photo, x, y, round(share * width), round(share * height))
+
+
+def crop_to_square(photo: TrialImage, where: float) -> TrialImage:
+    """The largest square; `where` in [0, 1] says where between the two edges of the longer side."""
+    height, width = photo.image.shape[:2]
+    side = min(width, height)
+    return crop_rectangle(photo, round(where * (width - side)), round(where * (height - side)), side, side)
+
+
+def crop_rectangle(photo: TrialImage, x: int, y: int, width: int, height: int) -> TrialImage:
+    """The pixels from column `x` and row `y` on."""
+    image = np.ascontiguousarray(photo.image[y : y + height, x : x + width])
     camera = _require_camera(photo)
     K = camera.K.copy()
     K[:2, 2] -= x, y

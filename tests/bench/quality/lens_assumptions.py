@@ -26,7 +26,14 @@ from typing import Any, Protocol
 import numpy as np
 
 from splatnode.extras.evaluate.dataset import load_scene
-from splatnode.extras.evaluate.stability.degradations import COUNTS, KINDS, SETTINGS, AssumptionBreak, set_intrinsics
+from splatnode.extras.evaluate.stability.degradations import (
+    COUNTS,
+    KINDS,
+    LATER_KINDS,
+    SETTINGS,
+    AssumptionBreak,
+    set_intrinsics,
+)
 from splatnode.extras.evaluate.stability.fitting import (
     Sample,
     exceeds_bounds,
@@ -66,6 +73,7 @@ from splatnode.recon.matching.view_graph import mask_moving_objects
 from splatnode.recon.verification.error_model import VerdictModel
 
 STEP_DEG = 12.0
+_ALL_KINDS = {**KINDS, **LATER_KINDS}
 
 
 @dataclass(frozen=True)
@@ -190,11 +198,11 @@ def run_scene(
             continue
         caches: dict[str, dict[PieceKey, bytes]] = defaultdict(dict)
         for setting in settings:
-            possible = [name for name in kinds if setting in KINDS[name].settings and name != "clean"]
+            possible = [name for name in kinds if setting in _ALL_KINDS[name].settings and name != "clean"]
             drawn = make_generator(count, f"{place.name} {setting}", draw).permutation(possible)
             for name in [*(["clean"] if "clean" in kinds else []), *drawn[:sample].tolist()]:
                 cache = caches["given" if setting == "given" else "centred"]
-                trial = run_trial(photos, KINDS[name], setting, cache, config)
+                trial = run_trial(photos, _ALL_KINDS[name], setting, cache, config)
                 found.append(replace(trial, draw=draw))
                 if journal is not None:
                     with journal.open("a") as lines:
@@ -280,7 +288,8 @@ def main() -> None:
         "--fitted-to", type=Path, nargs="+", default=(), help="the samples that --judge fits numbers to"
     )
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS)
-    parser.add_argument("--kinds", nargs="+", default=list(KINDS))
+    parser.add_argument("--kinds", nargs="+", choices=list(_ALL_KINDS), metavar="KIND")
+    parser.add_argument("--later", action="store_true", help="kinds that were made after all numbers were fitted")
     parser.add_argument("--settings", nargs="+", default=SETTINGS)
     parser.add_argument("--sample", type=int, help="kinds for each scene, number of images and setting, at most")
     parser.add_argument(
@@ -294,7 +303,7 @@ def main() -> None:
     of_scene = partial(
         run_scene,
         counts=arguments.counts,
-        kinds=arguments.kinds,
+        kinds=arguments.kinds or list(LATER_KINDS if arguments.later else KINDS),
         settings=arguments.settings,
         journal=journal,
         sample=arguments.sample,

@@ -363,6 +363,21 @@ def test_an_index_of_another_checkpoint_or_a_damaged_one_begins_anew(tmp_path):
     assert "blurred" in (tmp_path / "places.json").read_text()
 
 
+def test_a_node_that_goes_on_in_another_frame_of_reference_says_so(tmp_path, caplog):
+    place = make_submap_record("scene-0001", SubmapState.HERE, "scene-0001", make_snapshot(), [], [])
+    SubmapIndex(tmp_path, "one", "base").update(place)
+    SubmapIndex(tmp_path, "one", "base").mark_finished("scene-0001")
+    assert '"base"' in (tmp_path / "places.json").read_text() and not caplog.records
+    SubmapIndex(tmp_path, "other")
+    assert not caplog.records, "the results of another checkpoint are not its own"
+    SubmapIndex(tmp_path, "one").update(place)
+    assert "were in the frame base; from now on they are in the default frame: give --frame base" in caplog.text
+    assert '"base"' not in (tmp_path / "places.json").read_text()
+    caplog.clear()
+    SubmapIndex(tmp_path, "one", "upright")
+    assert "from now on they are in the frame upright: give no --frame" in caplog.text
+
+
 def test_a_scene_that_was_refused_has_no_cameras_and_this_is_no_fault(tmp_path, caplog):
     """Such as one whose frame of reference is not known yet: its folder has a report alone."""
     places = SubmapIndex(tmp_path, "one")

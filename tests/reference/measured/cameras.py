@@ -119,12 +119,13 @@ def lens_assumptions() -> str:
     groups.append(("all", lambda t: True))
     rows = [_lens_row(words, [t for t in changed if chosen(t)], clean) for words, chosen in groups]
     rows.append(_lens_row("unchanged", [t for t in trials if t["kind"] == "clean"], clean))
-    later = raw("lens_assumptions_draws_judged")["trials"]
-    same = {_key(t) for t in later if t["kind"] == "clean" and t["published"] and not t["wrong"]}
-    for setting, words in (("nothing", "no lens told"), ("exif", "EXIF"), ("given", "lens given")):
-        drawn = [t for t in later if t["kind"] != "clean" and t["setting"] == setting]
-        rows.append(_lens_row(f"drawn afterwards, 3 images, {words}", drawn, same))
-    require(len({t["scene"] for t in trials}) == len({t["scene"] for t in later}) == 11, "eleven scenes")
+    for name, what in (("draws", "drawn afterwards, 3 images"), ("later", "kinds made afterwards, 3 and 6 images")):
+        later = raw(f"lens_assumptions_{name}_judged")["trials"]
+        same = {_key(t) for t in later if t["kind"] == "clean" and t["published"] and not t["wrong"]}
+        for setting, words in (("nothing", "no lens told"), ("exif", "EXIF"), ("given", "lens given")):
+            drawn = [t for t in later if t["kind"] != "clean" and t["setting"] == setting]
+            rows.append(_lens_row(f"{what}, {words}", drawn, same))
+        require(len({t["scene"] for t in trials}) == len({t["scene"] for t in later}) == 11, "eleven scenes")
     return table(("images", "sets", "published", "wrong", "right, of those right unchanged"), rows)
 
 

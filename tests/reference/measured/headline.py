@@ -18,7 +18,8 @@ def headline() -> str:
 
 
 def _damaged() -> list[tuple[str, str, str]]:
-    judged = [*raw("lens_assumptions_judged")["trials"], *raw("lens_assumptions_draws_judged")["trials"]]
+    names = ("lens_assumptions", "lens_assumptions_draws", "lens_assumptions_later")
+    judged = [each for name in names for each in raw(f"{name}_judged")["trials"]]
     trials = [each for each in judged if each["kind"] != "clean"]
     matrix = raw("fit")["many"]["cross_validated"]["matrix"]
     return [
