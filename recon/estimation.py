@@ -343,9 +343,9 @@ def _register_and_verify(graph: ViewGraph, config: ReconstructionConfig, run: Ru
     evidence = verify(graph, seen, config.verification, run)
     give_back_memory()
     verdict = explain_refusal(decide(graph, seen, evidence, config.decision), graph)
-    suspects = frozenset() if seen is None else _find_shear_suspects(graph, seen, verdict)
-    shears = measure_shears(graph, seen) if seen is not None and (verdict.publishable or suspects) else {}
-    verdict = _name_sheared(verdict, shears, suspects)
+    limits = {} if seen is None else _limit_shears(graph, seen, verdict)
+    shears = measure_shears(graph, seen) if seen is not None and (verdict.publishable or limits) else {}
+    verdict = _name_sheared(verdict, shears, limits)
     if registration is not None and registration.rig is not None:
         verdict = describe_rig(verdict, graph, registration.rig)
     kept = registration if verdict.publishable else seen
@@ -356,22 +356,27 @@ def _register_and_verify(graph: ViewGraph, config: ReconstructionConfig, run: Ru
 _OF_SHEARED = Code.AMBIGUOUS, Code.FOCAL_SUSPECT, Code.PLANAR_ONLY
 _MOST_ALIKE = 3  # cameras with which a sheared one may agree by bending the scene
 _MOST_SHEAR = 0.01  # by which an image that is named is sheared, and differs from most others
+_SHEAR_OF_ANSWER = 0.04  # the same of images that share a lens, in an answer: a film of a telephone has up to .03
 _LEAST_SHEAR = 0.003  # below, bounds allow for it
 
 
-def _find_shear_suspects(graph: ViewGraph, registration: Registration, verdict: Verdict) -> frozenset[str]:
-    """The images whose shear may explain the verdict: all of a refusal, those with a lens of their own of an answer.
+def _limit_shears(graph: ViewGraph, registration: Registration, verdict: Verdict) -> dict[str, float]:
+    """Limits the shear of each image, by name, beyond which it is named; empty where none is to blame for the verdict.
 
-    Such a lens takes a shear up as a principal point far from the middle, and its camera aside.
+    A lens of its own takes a shear up as a principal point far from the middle, and its camera aside. Images of an
+    answer that share a lens may be sheared as a telephone's are that turns.
     """
     cameras = registration.cameras
     if len(cameras) <= _MOST_ALIKE or not (verdict.publishable or verdict.code in _OF_SHEARED):
-        return frozenset()
-    return frozenset(graph.names[each.index] for each in cameras if each.own_lens or not verdict.publishable)
+        return {}
+    return {
+        graph.names[each.index]: _MOST_SHEAR if each.own_lens or not verdict.publishable else _SHEAR_OF_ANSWER
+        for each in cameras
+    }
 
 
-def _name_sheared(verdict: Verdict, shears: Mapping[str, float], suspects: Collection[str]) -> Verdict:
-    """The refusal of the suspect that is sheared most, where it stands out, in place of what it looks like.
+def _name_sheared(verdict: Verdict, shears: Mapping[str, float], limits: Mapping[str, float]) -> Verdict:
+    """The refusal of the image that is sheared most, where it stands out, in place of what it looks like.
 
     What all images have alike, as of one pan, does not count.
     """
@@ -379,7 +384,7 @@ def _name_sheared(verdict: Verdict, shears: Mapping[str, float], suspects: Colle
     found = [
         (name, shear)
         for name, shear in shears.items()
-        if name in suspects and min(abs(shear), abs(shear - middle)) > _MOST_SHEAR
+        if name in limits and min(abs(shear), abs(shear - middle)) > limits[name]
     ]
     if not found:
         return verdict

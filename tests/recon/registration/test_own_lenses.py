@@ -22,6 +22,7 @@ from splatnode.extras.evaluate.stability.degradations import (
 )
 from splatnode.extras.evaluate.stability.perturbations import TrialImage, crop_image
 from splatnode.extras.evaluate.stability.trial import list_registered_cameras, make_frames, make_world, score_cameras
+from splatnode.recon import estimation
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import (
     LENS_INSIDE_BARS,
@@ -135,6 +136,23 @@ def test_a_sheared_image_is_named_and_left_out():
     assert left.verdict.code is Code.OK_PARTIAL and left.camera_names == {photo.name for photo in photos} - {
         photos[3].name
     }
+
+
+def test_an_answer_loses_the_image_that_stands_out_by_its_shear():
+    """By 1 % where the image has a lens of its own, which takes the shear up; else by 4 %: telephones shear films."""
+    found = estimate(photographs())
+    assert found.registration is not None and found.verdict.publishable
+    cameras, name = found.registration.cameras, photographs()[3].name
+    own = replace(found.registration, cameras=tuple(replace(c, own_lens=c.index == 3) for c in cameras))
+    few = replace(found.registration, cameras=cameras[:3])
+    for registration, shear, others, named in (
+        (found.registration, 0.05, 0.0, True), (found.registration, -0.03, 0.0, False), (own, -0.03, 0.0, True),
+        (own, 0.009, 0.0, False), (own, 0.05, 0.05, False), (few, 0.05, 0.0, False),
+    ):  # fmt: skip
+        limits = estimation._limit_shears(found.graph, registration, found.verdict)
+        shears = {photo.name: shear if photo.name == name else others for photo in photographs()}
+        verdict = estimation._name_sheared(found.verdict, shears, limits)
+        assert (verdict.code is Code.AMBIGUOUS and verdict.frames == (name,)) == named, (shear, others)
 
 
 def test_exif_that_cropped_images_contradict_is_not_used():
