@@ -26,7 +26,6 @@ from splatnode.recon.keyframes import (
 )
 from splatnode.recon.locating.localize import collect_landmarks, measure_shears
 from splatnode.recon.matching import features
-from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.matching.view_graph import Pair, ViewGraph
 from splatnode.recon.metric.depth_alignment import place_beside, place_by_depth
 from splatnode.recon.metric.depth_fit import fit_depth_images, make_depth_views
@@ -502,21 +501,22 @@ def _hold_by_depth(
     if found is None or found.given is None:
         return None
     given = replace(found.given, from_depth=True, scale_sigma=float(np.hypot(found.given.scale_sigma, scale_sigma)))
-    registration = _drop_doubtful_points(replace(found, given=given), graph.pairs)
+    telling = find_telling_pairs(graph.pairs)
+    registration = _drop_doubtful_points(replace(found, given=given), telling)
     verdict = decide_posed(graph, registration, given, config.decision)
     posed = Reconstruction(graph, registration, None, verdict)
-    is_refuted = _is_contradicted(posed, find_telling_pairs(graph.pairs)) or _points_contradict_depth(posed)
+    is_refuted = _is_contradicted(posed, telling) or _points_contradict_depth(posed)
     return None if is_refuted else posed
 
 
-def _drop_doubtful_points(registration: Registration, pairs: Mapping[Pair, TwoView]) -> Registration:
-    """Returns the registration without the points that no pair of many matches shows.
+def _drop_doubtful_points(registration: Registration, telling: Collection[Pair]) -> Registration:
+    """Returns the registration without the points that no `telling` pair, of many matches, shows.
 
     Between plain walls, few matches are often wrong; cameras that depth images place cannot tell.
     """
     observed, seen_by = registration.observed_point, registration.observed_by
     shown = np.zeros(len(registration.points), bool)
-    for pair in find_telling_pairs(pairs):
+    for pair in telling:
         first, second = (observed[seen_by == index] for index in pair)
         shown[np.intersect1d(first, second)] = True
     kept = shown[observed]

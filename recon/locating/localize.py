@@ -494,8 +494,8 @@ def localize_near(
     first = judged.make_hypothesis(chosen.posed, chosen.source)
     if verification.run_presence_checks(first, config.checks) is not None:
         return None
-    exact = PosePrior(chosen.posed.fit.camera, size, REACH * side, chosen.posed.fit.covariance)
-    known = match_landmarks(all_features, principal, landmarks, config.neighbours, exact)
+    refined = PosePrior(chosen.posed.fit.camera, size, REACH * side, chosen.posed.fit.covariance)
+    known = match_landmarks(all_features, principal, landmarks, config.neighbours, refined)
     judged = replace(judged, known=known)
     chosen = choose_lens(judged, [chosen.posed.fit.camera], assumed)
     if chosen is None or not chosen.as_assumed or chosen.posed.agreeing.sum() < len(first.inliers):

@@ -51,7 +51,7 @@ class DecisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     moving_flatness: Internal[float] = 0.99
     moving_inlier_ratio: Internal[float] = 0.845  # share of such a scene's matches that its poses must explain
     # Share of two cameras' points that shifted in a few pieces, where each pair has as much; pairs of photographs have
-    # .3 at most, montages .79 at least
+    # .26 at most, montages .79 at least
     max_shifted_share: Internal[float] = 0.6
     # Bounds beyond which nothing is known that a robot could use, and a scene is refused.
     max_rotation_deg: Internal[float] = 10.0  # largest 95 % bound of a camera's rotation

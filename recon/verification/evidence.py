@@ -420,10 +420,9 @@ def measure_shifted_share(keyframes: Sequence[Keyframe], registration: Registrat
     It is 0 where one shift explains each pair, as of a camera that did not move. Perspective changes shifts from point
     to point: of 251 pairs of photographs .26 is the largest share.
     """
-    scales = {c.index: longer_side(keyframes[c.index].frame) / REFERENCE_SIDE for c in registration.cameras}
+    seen = [_list_observed(registration, c.index, keyframes[c.index]) for c in registration.cameras]
     least, montage = 1.0, False
-    for first, second in combinations(scales, 2):
-        (points, pixels), (others, other_pixels) = (_list_observed(registration, i, scales[i]) for i in (first, second))
+    for (points, pixels), (others, other_pixels) in combinations(seen, 2):
         _, at, other_at = np.intersect1d(points, others, return_indices=True)
         if len(at) < FEWEST_SHARED:
             continue
@@ -435,10 +434,11 @@ def measure_shifted_share(keyframes: Sequence[Keyframe], registration: Registrat
 
 
 def _list_observed(
-    registration: Registration, index: int, scale: float
+    registration: Registration, index: int, keyframe: Keyframe
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
     """Lists the points that a camera observes, and their pixels at REFERENCE_SIDE."""
     (mine,) = np.nonzero(registration.observed_by == index)
+    scale = longer_side(keyframe.frame) / REFERENCE_SIDE
     return registration.observed_point[mine], registration.observed_pixels[mine] / scale
 
 

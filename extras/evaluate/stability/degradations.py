@@ -492,7 +492,7 @@ KINDS: Mapping[str, AssumptionBreak] = {
 
 # Kinds that were made after all numbers were fitted, which no number is fitted to.
 
-_SHEARED = 0.05  # of the width, from the first row to the last: a camera that pans by 60 degrees a second
+_SHEARED = 0.05  # of the width: 30 ms of a pan by 100 degrees a second, where the picture spans 60
 
 
 def _crop_to_squares(photos: Sequence[TrialImage], rng: np.random.Generator) -> list[TrialImage]:
@@ -506,7 +506,7 @@ def _crop_alike(photos: Sequence[TrialImage], rng: np.random.Generator) -> list[
     return [replace(photo, name=f"cropped_{photo.name}") for photo in cropped]
 
 
-def _zoom_two(photos: Sequence[TrialImage], rng: np.random.Generator) -> list[TrialImage]:
+def _zoom_third(photos: Sequence[TrialImage], rng: np.random.Generator) -> list[TrialImage]:
     chosen = rng.permutation(len(photos))[: max(2, len(photos) // 3)].tolist()
     return [
         zoom_image(photo, float(rng.uniform(1.1, 1.8))) if index in chosen else photo
@@ -536,7 +536,7 @@ LATER_KINDS: Mapping[str, AssumptionBreak] = {
         KINDS["clean"],
         AssumptionBreak("squares", _crop_to_squares, ("nothing",)),
         AssumptionBreak("all cropped alike", _crop_alike, ("nothing",)),
-        AssumptionBreak("a third zoomed", _zoom_two),
+        AssumptionBreak("a third zoomed", _zoom_third),
         AssumptionBreak("each zoomed", _zoom_all),
         AssumptionBreak("one zoomed 1.5, aside", _zoom_one_aside),
         AssumptionBreak("one sheared", _shear_one),

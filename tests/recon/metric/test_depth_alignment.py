@@ -207,7 +207,7 @@ def test_photographs_alone_are_refused_and_depth_gives_metres():
 
 @pytest.mark.parametrize(("count", "placed"), [(0, True), (35, True), (80, False)])
 def test_many_matches_may_contradict_the_depth_that_places_cameras_and_few_may_not(count, placed):
-    """Matches of points three times as near as the walls: the edges of plain walls give such ones, but not many."""
+    """Of points .8 m before the camera, nearer than the walls: edges of plain walls give such matches, but few."""
     config, rng = preset("preview"), np.random.default_rng(5)
     keyframes, _ = prepare_all(frames(), config)
     (T, K), (T_other, K_other) = room().cameras[:2]
