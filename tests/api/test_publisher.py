@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import time
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 import splatnode
 from splatnode.capture.config import PreviewHeader, decode_preview
 from splatnode.capture.frame import Clock, Stamp
+from splatnode.capture.keyframe_selection import Config
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW, Network
 from splatnode.capture.messaging.pubsub import Subscriber
@@ -88,8 +90,9 @@ def test_keyframes_are_selected_as_a_cameras_for_each_camera_on_its_own(tmp_path
     with splatnode.Publisher(changes=changes(tmp_path)) as node:
         assert node.publish(picture(0), camera_id="left").reason == "first view of this stream"
         assert node.publish(picture(1), camera_id="right").reason == "first view of this stream"
+        time.sleep(2.0 / Config().max_fps)  # until an image is examined, of no frame set before
         again = node.publish(picture(0), camera_id="left")
-        assert not again.taken and again.reason.startswith(("adds too little", "between two examinations"))
+        assert not again.taken and again.reason.startswith("adds too little")
         assert node.num_waiting == 2
 
 
