@@ -630,11 +630,8 @@ def _share_on_lines(geometry: pair_matching.TwoView, points1: Array, points2: Ar
     fundamental, _ = cv2.findFundamentalMat(geometry.points1, geometry.points2, cv2.FM_LMEDS)
     if fundamental is None or fundamental.shape != (3, 3):
         return 1.0  # nothing is known of what the geometry explains
-    ones = np.ones((len(points1), 1))
-    first, second = np.hstack([points1, ones]), np.hstack([points2, ones])
-    lines2, lines1 = first @ fundamental.T, second @ fundamental
-    norms = np.linalg.norm(np.hstack([lines1[:, :2], lines2[:, :2]]), axis=1)
-    return float((np.abs((second * lines2).sum(1)) < threshold * norms).mean())
+    errors = pair_matching.epipolar_errors(np.asarray(fundamental, np.float64), points1, points2)
+    return float((errors < threshold).mean())
 
 
 def _patch(points: Array, keyframe: Keyframe) -> float:

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.geometry import distortion
+from splatnode.recon.matching.pair_matching import count_explained, fit_epipolar_errors
 from splatnode.recon.registration import (
     bundle_adjustment,
     mapping_problem,
@@ -52,6 +53,7 @@ _QUICK_ITERATIONS, _QUICK_DECREASE = 10, 1e-3
 
 _MIN_IMPROVEMENT = 1.05  # factor of the score by which another model must be better to replace one
 _MIN_VIEWS = 3  # that must stay when doubtful ones are removed
+_FEW_VIEWS = 3  # whose lenses a model with a common one does not tell; of more it does
 
 
 class IncrementalMapperConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -82,7 +84,7 @@ def score(problem: MapperInput, partial: SparseModel, zero_px: float) -> float:
     `zero_px` is in pixels at REFERENCE_SIDE; matches with larger errors count 0.
     """
     errors = mapping_problem.pair_errors(problem, partial).values()
-    return sum(float(np.maximum(0.0, 1.0 - (of_pair / zero_px) ** 2).sum()) for of_pair in errors)
+    return sum(count_explained(of_pair, zero_px) for of_pair in errors)
 
 
 def adjust(
@@ -449,7 +451,8 @@ def build_model(
     found = _finish_best(problem, attempts, images, config, run)
     if found is None:
         return None
-    found = _try_other_hypotheses(problem, found, images, config, run)
+    found = _try_other_focal_lengths(problem, found, images, config, run)
+    found = _try_lenses_of_views(problem, found, images, config, run)
     return make_result(*found, config.incremental.triangulation.max_error_px, len(lenses))
 
 
@@ -485,7 +488,7 @@ def _finish_best(
     return None if finished is None else give_own_lenses(problem, finished, images, config, run)
 
 
-def _try_other_hypotheses(
+def _try_other_focal_lengths(
     problem: MapperInput,
     found: tuple[MapperInput, FinalModel],
     images: Sequence[PatchImage],
@@ -514,10 +517,40 @@ def _try_other_hypotheses(
         finished = run_final_adjustment(other[0], free, images, config.finishing)
         if finished is None:
             continue
-        before, after = _score_of(found[0], found[1].model, config), _score_of(other[0], finished.model, config)
-        if after * _AS_WELL > before:
-            found = other[0], finished
+        found = _choose_better(found, (other[0], finished), config)
     return found
+
+
+def _try_lenses_of_views(
+    problem: MapperInput,
+    found: tuple[MapperInput, FinalModel],
+    images: Sequence[PatchImage],
+    config: MapperConfig,
+    run: RunContext,
+) -> tuple[MapperInput, FinalModel]:
+    """Both with a lens for each of three views from the beginning, where pairs alone fit better, and this model does.
+
+    Few views let a common lens bend a model so far that no search from it finds their lenses. What fundamental
+    matrices explain more than the model tells whether there are better ones.
+    """
+    if len(problem.views) != _FEW_VIEWS or len(problem.lenses) == len(problem.views):
+        return found
+    zeros = {pair: config.score_px * float(problem.scale[pair[0]]) for pair in problem.pairs}
+    alone = sum(count_explained(fit_epipolar_errors(problem.pairs[k], zeros[k]), zeros[k]) for k in zeros)
+    if alone * _AS_WELL <= _score_of(found[0], found[1].model, config):
+        return found
+    run.pause()
+    apart = self_calibration.separate_views(problem)
+    other = _finish_best(apart, list(_attempt_models(apart, _OTHER_ATTEMPTS, config, run)), images, config, run)
+    return found if other is None else _choose_better(found, other, config)
+
+
+def _choose_better(
+    found: tuple[MapperInput, FinalModel], other: tuple[MapperInput, FinalModel], config: MapperConfig
+) -> tuple[MapperInput, FinalModel]:
+    """The other one of two models where it explains clearly more of the matches."""
+    before, after = (_score_of(each[0], each[1].model, config) for each in (found, other))
+    return other if after * _AS_WELL > before else found
 
 
 def _list_other_focals(problem: MapperInput, log_focals: Array) -> list[list[float | None]]:

@@ -501,6 +501,22 @@ def _pool_deviations(deviations: Array) -> Array:
     return sizes
 
 
+def separate_views(problem: MapperInput) -> MapperInput:
+    """The problem with a lens for each view, of which next to nothing is known; any view may be a crop."""
+    lenses, views = list(problem.lenses), []
+    seen: set[int] = set()
+    for view in problem.views:
+        lens = view.lens
+        if lens in seen:
+            lens = len(lenses)
+            lenses.append(problem.lenses[view.lens])
+        seen.add(lens)
+        views.append(replace(view, lens=lens))
+        widest_shift = OwnLensesConfig().widest_shift * view.longer_side
+        lenses[lens] = replace(lenses[lens], sigma=max(lenses[lens].sigma, _OWN_SIGMA), widest_shift=widest_shift)
+    return replace(problem, views=tuple(views), lenses=tuple(lenses))
+
+
 def add_lens(
     problem: MapperInput, partial: SparseModel, view: int, focal: float, shift: Array | None = None
 ) -> tuple[MapperInput, SparseModel]:

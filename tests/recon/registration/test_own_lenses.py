@@ -89,6 +89,15 @@ def test_a_digitally_zoomed_image_gets_a_lens_of_its_own(factor):
     assert photos[3].name in own(found)
 
 
+@pytest.mark.parametrize(("first", "factors"), [(3, (1.09, 1.41, 1.52)), (0, (1.0, 1.93, 1.14))])
+def test_three_images_zoomed_each_are_found_with_a_lens_each(first, factors):
+    """No search from the model with a common lens finds them."""
+    chosen = photographs()[first : first + 3]
+    photos = [zoom_image(photo, factor) for photo, factor in zip(chosen, factors, strict=True)]
+    found = estimate(photos)
+    check_within_bounds(photos, found)
+
+
 @pytest.mark.parametrize("setting", ["exif", "given"])
 def test_an_image_that_contradicts_what_is_told_gets_a_lens_of_its_own(setting):
     told = set_intrinsics(photographs(), setting)
