@@ -40,7 +40,7 @@ from splatnode.capture.process.terminal import (
 from splatnode.capture.process.text import sanitize_text
 from splatnode.capture.reader import Reader, ReaderState
 from splatnode.capture.recording import Recorder
-from splatnode.capture.status import describe_heartbeat, heartbeats, last_run, mark_problems_seen, parse_camera_id
+from splatnode.capture.status import describe_heartbeat, last_run, mark_problems_seen, parse_camera_id, read_heartbeats
 
 # One configuration with several cameras: a capture process for each, with its camera id.
 
@@ -228,7 +228,7 @@ def status(args: argparse.Namespace) -> int:
         parse_config(read_yaml(args.config).get("network") or {}, Network, "network") if args.config else Network()
     )
     with show_waiting("listening for capture and recon"):
-        found = heartbeats(network)
+        found = read_heartbeats(network)
     silent_captures = {room for room in found if room != "recon" and found[room] is None}
     ended = {room: run for room in silent_captures if (run := last_run(network, parse_camera_id(room))) is not None}
     if args.json:

@@ -82,7 +82,9 @@ class _Listener(Subscriber):
         """Counts nothing: one heartbeat is enough."""
 
 
-def heartbeats(network: Network, wait_s: float = WAIT_S, only: str | None = None) -> dict[str, dict[str, Any] | None]:
+def read_heartbeats(
+    network: Network, wait_s: float = WAIT_S, only: str | None = None
+) -> dict[str, dict[str, Any] | None]:
     """The next heartbeat of each process by its room's name; None for one that is silent. Raises NotAllowed.
 
     A capture beside others is `capture@left`, by its camera id. `only` is the one to wait for; None: all.
@@ -106,7 +108,7 @@ def _name_capture(camera_id: str) -> str:
 
 
 def parse_camera_id(room: str) -> str:
-    """The camera id of a capture beside others, by its name in what `heartbeats` returns; empty where it has none."""
+    """The camera id of a capture beside others, by its name in `read_heartbeats`' result; empty where it has none."""
     return room.partition("@")[2]
 
 

@@ -26,7 +26,7 @@ import yaml
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.status import heartbeats
+from splatnode.capture.status import read_heartbeats
 from splatnode.recon.daemon.checkpoint import Store
 from tests.support.synthetic import SMALL, places
 
@@ -108,7 +108,7 @@ def wait_until_at_rest(network: Network) -> None:
     """Raises TimeoutError where the node still works after `PATIENCE_S`."""
     until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
-        status = heartbeats(network, 1.0)["recon"]
+        status = read_heartbeats(network, 1.0)["recon"]
         if status is not None and status["state"] in RESTING and not status["unfinished"] and status["final"]:
             return
     raise TimeoutError(f"the node was not at rest after {PATIENCE_S:.0f} s")

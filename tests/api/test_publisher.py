@@ -18,7 +18,7 @@ from splatnode.capture.keyframe_selection import Config
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW, Network
 from splatnode.capture.messaging.pubsub import Subscriber
-from splatnode.capture.status import heartbeats
+from splatnode.capture.status import read_heartbeats
 from tests.capture.messaging.test_sockets import wait_for
 from tests.conftest import ROOT
 
@@ -82,7 +82,7 @@ def test_previews_and_the_heartbeat_are_a_cameras(tmp_path):
         numbers = iter(range(1000))
         shown = wait_for(lambda: node.publish(picture(next(numbers))) and previews.latest(0.02), 10.0)
         assert decode_preview(shown).shape == (240, 320, 3) and shown.header.state == "streaming"
-        found = wait_for(lambda: (beat := heartbeats(network, 0.5)["capture"]) and beat["frames"] and beat, 10.0)
+        found = wait_for(lambda: (beat := read_heartbeats(network, 0.5)["capture"]) and beat["frames"] and beat, 10.0)
     assert found["camera"] == "program" and found["state"] == "streaming" and found["keyframes"] == found["waiting"]
 
 

@@ -28,7 +28,7 @@ from splatnode.capture.messaging.messages import FrameHeader, Key, encode
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW, CAPTURE_STATUS, Network
 from splatnode.capture.messaging.pubsub import Subscriber
 from splatnode.capture.process.system import FailedAfterReady
-from splatnode.capture.status import CaptureStatus, heartbeats, last_run
+from splatnode.capture.status import CaptureStatus, last_run, read_heartbeats
 from tests.capture.messaging.test_sockets import wait_for
 from tests.conftest import ROOT
 
@@ -210,7 +210,7 @@ def test_status_tells_what_was_refused_until_it_is_seen(tmp_path, start):
     with KeyframeClient(network(tmp_path)) as client:
         wait_for(lambda: client.receive(0.05))  # a good one comes after those that are refused
     status = wait_for(
-        lambda: (it := heartbeats(network(tmp_path), only="capture")["capture"]) and it["set_aside"] == 3 and it
+        lambda: (it := read_heartbeats(network(tmp_path), only="capture")["capture"]) and it["set_aside"] == 3 and it
     )
     assert [each["name"] for each in status["newest_set_aside"]] == ["old2.png", "old1.png", "old0.png"]
     assert "3 keyframes were set aside, the last: old2.png: refused by recon" in status["problem"]
@@ -220,7 +220,7 @@ def test_status_tells_what_was_refused_until_it_is_seen(tmp_path, start):
     process.terminate()
     assert process.wait(60) == 0
     start(", loops: 1000")
-    status = wait_for(lambda: heartbeats(network(tmp_path), only="capture")["capture"])
+    status = wait_for(lambda: read_heartbeats(network(tmp_path), only="capture")["capture"])
     assert status["set_aside"] == 3 and status["problem"] == ""
 
 
@@ -296,7 +296,7 @@ def test_status_tells_a_capture_that_has_finished_from_one_that_is_silent(tmp_pa
     )
     assert "recon: nothing heard of it" in told
     start(", loops: 1000")
-    wait_for(lambda: heartbeats(network(tmp_path), only="capture")["capture"])
+    wait_for(lambda: read_heartbeats(network(tmp_path), only="capture")["capture"])
     assert last_run(network(tmp_path)) is None
 
 

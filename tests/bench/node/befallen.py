@@ -10,7 +10,7 @@ import time
 
 from splatnode.capture.messaging.network import RECON_SCENE
 from splatnode.capture.messaging.pubsub import StateClient
-from splatnode.capture.status import heartbeats
+from splatnode.capture.status import read_heartbeats
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.ledger import MADE_ANEW
 from splatnode.recon.result.message import SceneHeader
@@ -126,7 +126,7 @@ def full_disk(trial: Trial) -> None:
             node.start("recon")
             node.start("capture")
             deadline = time.monotonic() + 120
-            while (status := heartbeats(node.network)["recon"]) is None or status["state"] != "full":
+            while (status := read_heartbeats(node.network)["recon"]) is None or status["state"] != "full":
                 expect(time.monotonic() < deadline, f"recon does not tell that the disk is full: {status}")
             trial.some_time(4.0)
             expect(node.spooled() > 0, "keyframes were acknowledged that were not stored")

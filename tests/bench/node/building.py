@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatnode.capture.status import heartbeats
+from splatnode.capture.status import read_heartbeats
 from splatnode.extras.cameras import building
 from splatnode.recon.result.export import read_cameras
 from tests.bench.node.building_cost import Sample, cost_row, folder_mb
@@ -100,7 +100,7 @@ def walked(folder: Path, config: building.Config, recon: dict, patience_s: float
             time.sleep(LOOK_S)
             if node.processes["recon"].poll() is not None:
                 break  # its exit code tells
-            found = heartbeats(node.network)
+            found = read_heartbeats(node.network)
             capture_status, recon_status = found["capture"], found["recon"]
             if recon_status is None:
                 continue

@@ -19,7 +19,7 @@ from typing import Any
 
 import cv2
 
-from splatnode.capture.status import heartbeats
+from splatnode.capture.status import read_heartbeats
 from splatnode.extras.cameras import building
 from tests.bench.node.building import LOOK_S, RESTS, scored
 from tests.support.node import Node, at_rest, memory_mb, processor_s, running, taken
@@ -74,7 +74,7 @@ def live(film: Path, folder: Path, walk: building.Config, patience_s: float) -> 
         limit_s = walk.keyframes / walk.fps + patience_s
         while resting < RESTS and time.monotonic() - began < limit_s and node.processes["recon"].poll() is None:
             time.sleep(LOOK_S)
-            found = heartbeats(node.network)
+            found = read_heartbeats(node.network)
             peak_mb, spent_s = max(peak_mb, memory_mb(pid)), processor_s(pid)
             done = taken(found["capture"]) and found["recon"] is not None and at_rest(found["recon"])
             resting = resting + 1 if done else 0

@@ -26,7 +26,7 @@ from typing import Any
 
 import cv2
 
-from splatnode.capture.status import heartbeats
+from splatnode.capture.status import read_heartbeats
 from splatnode.extras.cameras import building
 from tests.bench.node.trial import expect_exports_whole
 from tests.bench.node.walk_faults import RECON, SIDE
@@ -131,7 +131,7 @@ def rests(node: Node, patience_s: float) -> bool:
     """Whether there comes to be nothing to do for the node."""
     deadline, resting = time.monotonic() + patience_s, 0
     while resting < RESTS and time.monotonic() < deadline:
-        found = heartbeats(node.network)
+        found = read_heartbeats(node.network)
         capture, recon = found["capture"], found["recon"]
         has_all = capture is not None and not capture["waiting"] and capture["state"] != "starting"
         idle = recon is not None and not recon["unfinished"] and not recon["queue"] and recon["state"] not in BUSY

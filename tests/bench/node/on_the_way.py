@@ -15,7 +15,7 @@ from typing import Any
 from splatnode.capture.messaging.network import RECON_SCENE, Network, create_keys, expect_server
 from splatnode.capture.messaging.pubsub import StateClient
 from splatnode.capture.process.config import parse_config
-from splatnode.capture.status import heartbeats
+from splatnode.capture.status import read_heartbeats
 from splatnode.recon.daemon.ledger import MADE_ANEW
 from splatnode.recon.result.message import SceneHeader
 from tests.bench.node.intruders import refusal
@@ -51,7 +51,7 @@ class Way:
 
     def recon(self) -> dict[str, Any] | None:
         """Its heartbeat."""
-        return heartbeats(self.node.network)["recon"]
+        return read_heartbeats(self.node.network)["recon"]
 
     def wait_until_worked_in(self) -> None:
         """Until recon has all that was shown, and few keyframes wait to be in a scene."""

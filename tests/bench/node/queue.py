@@ -27,7 +27,7 @@ from splatnode.capture.frame import Frame
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient, KeyframeServer, Spool, SpoolConfig
 from splatnode.capture.messaging.messages import FrameHeader, Key, Numbering, Part, encode
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.status import heartbeats
+from splatnode.capture.status import read_heartbeats
 from tests.bench.node.trial import RECON, expect, expect_scene
 from tests.support.node import Node, running
 from tests.support.synthetic import photographs
@@ -127,7 +127,7 @@ def processes(folder: Path, count: int) -> dict[str, Any]:
             expect(all(each.poll() is None for each in node.processes.values()), "a process ended")
             time.sleep(0.2)
         expect_scene(node, len(images))
-        said = heartbeats(node.network)
+        said = read_heartbeats(node.network)
         named = set(re.findall(r"set aside (\S+):", node.log("capture")))
         codes = {verb: node.end(verb) for verb in ("capture", "recon")}
     capture, recon = (said[room] or {} for room in ("capture", "recon"))

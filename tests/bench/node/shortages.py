@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from splatnode.capture.status import heartbeats
+from splatnode.capture.status import read_heartbeats
 from tests.bench.node.trial import NotTried, Trial, expect, expect_scene, expect_whole, wait_for
 from tests.support.disk_faults import compiled, environment
 from tests.support.node import Node, running
@@ -36,7 +36,7 @@ def remounted(folder: Path, options: str) -> None:
 
 
 def problem_of(node: Node, verb: str = "recon") -> str:
-    status = heartbeats(node.network)[verb]
+    status = read_heartbeats(node.network)[verb]
     return "" if status is None else status["problem"] if verb == "recon" else status["why"]
 
 

@@ -29,7 +29,7 @@ from splatnode.capture.cameras.synthetic import TARGET, Config, intrinsic_matrix
 from splatnode.capture.config import PreviewHeader
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW, create_keys
 from splatnode.capture.messaging.pubsub import Subscriber
-from splatnode.capture.status import heartbeats
+from splatnode.capture.status import read_heartbeats
 from tests.bench.node.soak import SAMPLE_S, change, sample
 from tests.bench.node.trial import RECON
 from tests.conftest import ROOT
@@ -65,7 +65,7 @@ def main() -> None:
                 node.start(verb)
             watched = Watched(node, args)
             watched.run()
-            said = heartbeats(node.network)
+            said = read_heartbeats(node.network)
             codes = {verb: node.end(verb) for verb in ("capture", "recon")}
     result = {
         "command": shlex.join(["python", "-m", "tests.bench", "siege", *sys.argv[1:]]),

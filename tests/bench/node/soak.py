@@ -24,7 +24,7 @@ import numpy as np
 from splatnode.capture.config import PreviewHeader
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW
 from splatnode.capture.messaging.pubsub import Subscriber
-from splatnode.capture.status import heartbeats
+from splatnode.capture.status import read_heartbeats
 from tests.support.node import Node, descriptors, memory_mb, running
 
 SAMPLE_S = 5.0
@@ -41,7 +41,7 @@ def main() -> None:
         for verb in ("recon", "capture"):
             node.start(verb)
         latencies, lost, samples = watch(node, args.minutes * 60)
-        said = heartbeats(node.network)
+        said = read_heartbeats(node.network)
         waiting = node.spooled()
         codes = {verb: node.end(verb) for verb in ("capture", "recon")}
     result = {

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatnode.capture.status import heartbeats
+from splatnode.capture.status import read_heartbeats
 from splatnode.extras.evaluate.dataset import EvaluationScene, Split, load_scene
 from splatnode.extras.evaluate.protocol import compare_cameras
 from splatnode.recon.config import ReconstructionConfig
@@ -183,7 +183,7 @@ def _streamed(
         taken_s, finished_s, resting = None, None, 0
         while finished_s is None and time.monotonic() < deadline:
             time.sleep(LOOK_S)
-            found = heartbeats(node.network)
+            found = read_heartbeats(node.network)
             capture, recon = found["capture"], found["recon"]
             peak_mb = max(peak_mb, memory_mb(pid))
             if recon is None:

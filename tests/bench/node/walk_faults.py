@@ -25,7 +25,7 @@ import cv2
 import msgspec
 
 from splatnode.capture.messaging.network import create_keys, expect_server
-from splatnode.capture.status import heartbeats
+from splatnode.capture.status import read_heartbeats
 from splatnode.extras.cameras import building
 from tests.bench.node import on_the_way
 from tests.bench.node.building import scored
@@ -130,7 +130,7 @@ def _ended(way: Way, walk: building.Config) -> dict[str, Any]:
     node = way.node
 
     def idle() -> bool:
-        recon = heartbeats(node.network)["recon"]
+        recon = read_heartbeats(node.network)["recon"]
         return recon is not None and at_rest(recon)
 
     wait_for(idle, "rest of recon", 3600.0)

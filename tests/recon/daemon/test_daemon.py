@@ -19,7 +19,7 @@ from splatnode.capture.messaging.keyframe_queue import KeyframeServer, Spool, Sp
 from splatnode.capture.messaging.network import RECON_CONTROL, RECON_SCENE, AlreadyRunning, Network
 from splatnode.capture.messaging.pubsub import StateClient, ask
 from splatnode.capture.process.files import LOCK
-from splatnode.capture.status import heartbeats
+from splatnode.capture.status import read_heartbeats
 from splatnode.recon.config import PREVIEW
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 from splatnode.recon.daemon import submap, worker
@@ -149,7 +149,7 @@ def test_keyframes_become_a_scene_that_survives_the_process_and_forgets_what_it_
         peer.wait_for_acknowledgements()
         with pytest.raises(AlreadyRunning):
             Daemon(config, threading.Event())
-        status = heartbeats(config.network, only="recon")["recon"]
+        status = read_heartbeats(config.network, only="recon")["recon"]
         assert status["keyframes"] == 4
         assert status["bounds"] == format_widest_bounds(scene.snapshot.cameras, RELATIVE) != ""
     exported = read_cameras(config.out / "scene-0001" / "cameras.json")
@@ -234,7 +234,7 @@ def test_a_nearly_full_disk_is_a_problem_that_the_status_tells_until_there_is_ro
     tmp = config.out.parent
 
     def problem() -> str:
-        return heartbeats(config.network, only="recon")["recon"]["problem"]
+        return read_heartbeats(config.network, only="recon")["recon"]["problem"]
 
     with running(replace(config, max_views=10, max_gaussians=10_000)), caplog.at_level("INFO"):
         assert problem() == ""

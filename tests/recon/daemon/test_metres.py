@@ -9,7 +9,7 @@ import numpy as np
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import make_given_pose
-from splatnode.capture.status import heartbeats
+from splatnode.capture.status import read_heartbeats
 from splatnode.recon.daemon.output import MetricScaler
 from splatnode.recon.keyframes import Features, Keyframe
 from splatnode.recon.metric.measurement import MetricConfig as Metric
@@ -48,7 +48,7 @@ def test_poses_of_keyframes_give_what_is_shown_and_what_is_written_metres(config
             peer.server.offer(frame)
         scene = peer.wait(finished(3), "a final scene").snapshot
         first = next(heard.snapshot for heard in peer.heard if len(heard.snapshot.cameras) == 3)
-        assert heartbeats(config.network, only="recon")["recon"]["bounds"].count(" m")
+        assert read_heartbeats(config.network, only="recon")["recon"]["bounds"].count(" m")
     for shown in (first, scene):
         assert shown.scale.metric and shown.scale.source.startswith("poses of 3 photographs, known to ")
         low, high = shown.scale.interval_95

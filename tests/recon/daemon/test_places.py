@@ -16,7 +16,7 @@ from splatnode.capture.frame import DroppedFrame, Frame, rename_frame
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.network import RECON_CONTROL
 from splatnode.capture.messaging.pubsub import Answer, ask
-from splatnode.capture.status import heartbeats
+from splatnode.capture.status import read_heartbeats
 from splatnode.recon.daemon import checkpoint, ledger, worker
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.ingest import BATCH, ArrivedKeyframe, Inbox
@@ -49,6 +49,10 @@ NEVER_S = 1e6
 
 
 @pytest.fixture
+def is_lost(network):
+    return read_heartbeats(network, only="recon")["recon"]["state"] == "lost"
+
+
 def moving(config):
     """A camera that never rests."""
     return replace(config, idle_finalize_s=NEVER_S)
@@ -98,8 +102,8 @@ def test_a_place_that_was_left_is_finished_while_the_camera_rests_in_another(con
         offer_when_three_are_shown(peer, frames)
         peer.wait(lambda scene: scene.scene_id == "scene-0002" and scene.snapshot.final, "another place, finished")
         peer.wait_for_acknowledgements()
-        wait_for(lambda: heartbeats(config.network, only="recon")["recon"]["unfinished"] == 0, PATIENCE_S)
-        status = heartbeats(config.network, only="recon")["recon"]
+        wait_for(lambda: read_heartbeats(config.network, only="recon")["recon"]["unfinished"] == 0, PATIENCE_S)
+        status = read_heartbeats(config.network, only="recon")["recon"]
         assert status["delay_s"] == 0 and status["delay"] == ""
     first, second = index(config)
     assert (first["scene_id"], first["state"], first["folder"]) == ("scene-0001", "finished", "scene-0001")
@@ -127,7 +131,7 @@ def test_a_keyframe_is_taken_out_of_a_place_that_was_left(config, peer):
         answer = ask(RECON_CONTROL, config.network, RemoveKeyframe(name), Answer)
         assert answer.done and "scene-0001, which the camera has left" in answer.message
         wait_for(lambda: name not in index(config)[0]["frames_used"], PATIENCE_S)
-        wait_for(lambda: heartbeats(config.network, only="recon")["recon"]["unfinished"] == 0, PATIENCE_S)
+        wait_for(lambda: read_heartbeats(config.network, only="recon")["recon"]["unfinished"] == 0, PATIENCE_S)
         assert not ask(RECON_CONTROL, config.network, RemoveKeyframe("nothing.png"), Answer).done
     first, second = index(config)
     assert {each["name"]: each["reason"] for each in first["frames_dropped"]} == {name: "retracted"}
@@ -195,11 +199,11 @@ def test_a_place_that_cannot_be_finished_keeps_no_other_waiting(config, peer, mo
         wait_for(
             lambda: (
                 peer.server.serve(0.02)
-                or "for the test" in heartbeats(config.network, only="recon")["recon"]["problem"]
+                or "for the test" in read_heartbeats(config.network, only="recon")["recon"]["problem"]
             ),
             PATIENCE_S,
         )
-        status = heartbeats(config.network, only="recon")["recon"]
+        status = read_heartbeats(config.network, only="recon")["recon"]
         assert status["state"] == "idle" and status["unfinished"] == 1
     assert report(config.out / "scene-0001-provisional")["verdict"]["provisional"]
 
@@ -246,7 +250,7 @@ def test_room_is_made_only_for_what_fits(moving, peer):
         for number, frame in enumerate(others):
             peer.server.offer(rename_frame(frame, 4 + number, f"other{number}.png", 4 + number))
         wait_for(
-            lambda: peer.server.serve(0.02) or heartbeats(moving.network, only="recon")["recon"]["state"] == "lost",
+            lambda: peer.server.serve(0.02) or is_lost(moving.network),
             PATIENCE_S,
         )
     (place,) = index(moving)
@@ -296,9 +300,7 @@ def test_what_was_set_aside_before_stays_with_the_scene_that_is_left(moving, pee
             peer.server.offer(frame)
             if frame.name == "stranger.png":
                 wait_for(
-                    lambda: (
-                        peer.server.serve(0.02) or heartbeats(moving.network, only="recon")["recon"]["state"] == "lost"
-                    ),
+                    lambda: peer.server.serve(0.02) or is_lost(moving.network),
                     PATIENCE_S,
                 )
             elif count >= 3:

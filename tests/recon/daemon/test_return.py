@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging.messages import ReceivedFrame
-from splatnode.capture.status import heartbeats
+from splatnode.capture.status import read_heartbeats
 from splatnode.extras.evaluate.protocol import compare_cameras
 from splatnode.recon.daemon import checkpoint, ledger
 from splatnode.recon.daemon import loop_closure as module
@@ -60,7 +60,7 @@ def walked(config, peer):
     """The daemon, once it has shown all three scenes and finished the two that were left."""
     with running(config):
         offer_walk(peer)
-        wait_for(lambda: heartbeats(config.network, only="recon")["recon"]["unfinished"] == 0, PATIENCE_S)
+        wait_for(lambda: read_heartbeats(config.network, only="recon")["recon"]["unfinished"] == 0, PATIENCE_S)
         yield
 
 
@@ -76,8 +76,8 @@ def kidnapped(config):
 def test_a_place_that_the_camera_comes_back_to_is_recognised(kidnapped, peer):
     with walked(kidnapped, peer):
         wait_for(lambda: places_file(kidnapped)["links"], PATIENCE_S)
-        wait_for(lambda: heartbeats(kidnapped.network, only="recon")["recon"]["loops"] == 1, PATIENCE_S)
-        status = heartbeats(kidnapped.network, only="recon")["recon"]
+        wait_for(lambda: read_heartbeats(kidnapped.network, only="recon")["recon"]["loops"] == 1, PATIENCE_S)
+        status = read_heartbeats(kidnapped.network, only="recon")["recon"]
         assert (status["scenes"], status["maps"]) == (3, 2)
     (link,) = places_file(kidnapped)["links"]
     assert (link["kind"], link["scene"], link["other"]) == ("loop", "scene-0001", "scene-0003")
@@ -103,13 +103,13 @@ def test_it_is_recognised_before_any_scene_is_made_and_the_loop_stays_when_they_
         patch.setattr(InactiveSubmaps, "finalize_next", lambda *_: False)
         offer_walk(peer)
         wait_for(lambda: places_file(kidnapped)["links"], PATIENCE_S)
-        wait_for(lambda: heartbeats(kidnapped.network, only="recon")["recon"]["scenes"] == 3, PATIENCE_S)
+        wait_for(lambda: read_heartbeats(kidnapped.network, only="recon")["recon"]["scenes"] == 3, PATIENCE_S)
     drafts = places_file(kidnapped)
     assert [place["judged"] for place in drafts["places"]] == [True] * 3
     assert [folder.name for folder in ledger.list_left_folders(kidnapped.checkpoint)] == ["scene-0001", "scene-0002"]
     with running(kidnapped):
         wait_for(lambda: not ledger.list_left_folders(kidnapped.checkpoint), PATIENCE_S)
-        wait_for(lambda: heartbeats(kidnapped.network, only="recon")["recon"]["unfinished"] == 0, PATIENCE_S)
+        wait_for(lambda: read_heartbeats(kidnapped.network, only="recon")["recon"]["unfinished"] == 0, PATIENCE_S)
     whole = places_file(kidnapped)
     assert not any(place["provisional"] for place in whole["places"])
     (before,), (link,) = drafts["links"], whole["links"]

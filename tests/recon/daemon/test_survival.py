@@ -19,7 +19,7 @@ from splatnode.capture.messaging.messages import FrameHeader, Key, Numbering, en
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW, RECON_CONTROL
 from splatnode.capture.messaging.pubsub import Answer, MarkProblemsSeen, Publisher, ask
 from splatnode.capture.process.terminal import Problems
-from splatnode.capture.status import heartbeats
+from splatnode.capture.status import read_heartbeats
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 from splatnode.recon.daemon import checkpoint, ingest, relocalization
 from splatnode.recon.daemon.checkpoint import Store
@@ -267,10 +267,10 @@ def test_while_a_checkpoint_is_loaded_the_status_says_so(config, monkeypatch):  
     restore, go_on = checkpoint.restore, threading.Event()
     monkeypatch.setattr(checkpoint, "restore", lambda *given: go_on.wait(60) and restore(*given))
     with running(config):
-        status = wait_for(lambda: heartbeats(config.network, only="recon")["recon"])
+        status = wait_for(lambda: read_heartbeats(config.network, only="recon")["recon"])
         assert (status["state"], status["delay"]) == ("loading", "2 keyframes are being loaded")
         go_on.set()
-        wait_for(lambda: heartbeats(config.network, only="recon")["recon"]["state"] != "loading")
+        wait_for(lambda: read_heartbeats(config.network, only="recon")["recon"]["state"] != "loading")
 
 
 def test_a_checkpoint_that_there_is_no_memory_for_is_left_as_it_is(tmp_path, monkeypatch):
@@ -295,7 +295,7 @@ def test_the_running_daemon_tells_what_was_refused_and_answers_what_fails(config
         assert peer.server.set_aside == 8 and peer.server.acknowledged == 1
 
         def problem() -> str:
-            return heartbeats(config.network, only="recon")["recon"]["problem"]
+            return read_heartbeats(config.network, only="recon")["recon"]["problem"]
 
         wait_for(lambda: "8 keyframes that were refused" in problem())
         assert ask(RECON_CONTROL, config.network, MarkProblemsSeen(), Answer).done

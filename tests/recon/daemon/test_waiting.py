@@ -15,7 +15,7 @@ import msgspec
 import pytest
 
 from splatnode.capture.messaging.messages import ReceivedFrame
-from splatnode.capture.status import heartbeats
+from splatnode.capture.status import read_heartbeats
 from splatnode.recon import incremental
 from splatnode.recon.config import ReconstructionConfig as Recipe
 from splatnode.recon.daemon import ReconState, checkpoint, ledger
@@ -43,7 +43,7 @@ def store_all(store, frames) -> list:
 
 def at_rest(config) -> bool:
     """Whether the node has nothing left to do."""
-    status = heartbeats(config.network, 1.0, only="recon")["recon"]
+    status = read_heartbeats(config.network, 1.0, only="recon")["recon"]
     if status is None or status["state"] not in ("idle", "waiting", "lost") or status["delay_s"] > 0:
         return False
     return status["unfinished"] == 0 and all(not each["provisional"] for each in index(config))

@@ -11,7 +11,7 @@ import pytest
 from msgspec.structs import replace
 
 from splatnode.capture.process.terminal import ProgressStep
-from splatnode.capture.status import describe_heartbeat, heartbeats
+from splatnode.capture.status import describe_heartbeat, read_heartbeats
 from splatnode.recon.daemon import FINAL_BASE_S, FINAL_S_A_VIEW, Backlog, Work, WorkMeter, WorkProgress, weigh_final
 from splatnode.recon.optimize import training
 from tests.conftest import ROOT
@@ -120,7 +120,7 @@ def test_a_running_node_tells_what_it_does_and_what_is_left(config, peer):  # no
         while not any(each["left_s"] is not None and each["of"] == 2000 for each in told):
             assert time.monotonic() < deadline, told[-5:]
             peer.server.serve(0.01)
-            heard = heartbeats(config.network, 0.3, only="recon")["recon"]
+            heard = read_heartbeats(config.network, 0.3, only="recon")["recon"]
             if heard is not None and heard["work"] is not None:
                 told.append(heard["work"])
         (line,) = [each for each in describe_heartbeat("recon", heard) if each.startswith("  now ")]
