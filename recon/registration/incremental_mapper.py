@@ -10,6 +10,7 @@ import functools
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import msgspec
 import numpy as np
@@ -374,6 +375,7 @@ _AS_WELL, _NEARLY = 0.97, 0.9
 _FAR_FROM_TYPICAL = 0.5
 _FAR_FROM_VOTE = 0.3
 _HELD_SIGMA = 0.15  # of log focal, while such a focal length is held
+_APART = 0.1  # difference of log focals from which on views have a lens each
 _OTHER_ATTEMPTS = 3  # first pairs that are tried with it
 _UNEXPLAINED_BY_PLANE = 1.05  # less the planar share of a pair: above 1, so that a planar pair is better than none
 
@@ -444,7 +446,7 @@ def build_model(
     problem = mapping_problem.prepare(views, lenses, pairs, config.max_growing_tracks, config.max_final_tracks)
     attempts: list[tuple[float, SparseModel]] = []
     for attempt in _attempt_models(problem, config.max_attempts, config, run):
-        found_again = bool(attempts) and _is_same_model(max(attempts, key=_score)[1], attempt[1], config)
+        found_again = bool(attempts) and _is_same_model(max(attempts, key=itemgetter(0))[1], attempt[1], config)
         attempts.append(attempt)
         if found_again and len(attempt[1].registered) == len(views):
             break
@@ -478,7 +480,7 @@ def _finish_best(
     if not attempts:
         return None
     run.pause()
-    best = max(attempts, key=_score)[1]
+    best = max(attempts, key=itemgetter(0))[1]
     coherent = mapping_problem.drop_repeated_structures(
         problem, best, config.max_growing_tracks, config.max_final_tracks
     )
@@ -542,7 +544,16 @@ def _try_lenses_of_views(
     run.pause()
     apart = self_calibration.separate_views(problem)
     other = _finish_best(apart, list(_attempt_models(apart, _OTHER_ATTEMPTS, config, run)), images, config, run)
-    return found if other is None else _choose_better(found, other, config)
+    if other is None or not _has_lenses_apart(problem, other[1].model):
+        return found
+    return _choose_better(found, other, config)
+
+
+def _has_lenses_apart(problem: MapperInput, partial: SparseModel) -> bool:
+    """Whether focal lengths of a model with a lens each differ among views that `problem` has one lens for."""
+    log_focals = partial.estimate.log_focals[partial.estimate.lens_of_camera]
+    groups = [[v for v in partial.registered if problem.views[v].lens == lens] for lens in range(len(problem.lenses))]
+    return any(np.ptp(log_focals[group]) > _APART for group in groups if group)
 
 
 def _choose_better(
@@ -738,10 +749,6 @@ def _is_same_lens(problem: MapperInput, finished: FinalModel, view: int, common:
 
 def _score_of(problem: MapperInput, partial: SparseModel, config: MapperConfig) -> float:
     return score(problem, partial, config.score_px)
-
-
-def _score(attempt: tuple[float, SparseModel]) -> float:
-    return attempt[0]
 
 
 def _is_same_model(one: SparseModel, other: SparseModel, config: MapperConfig) -> bool:
