@@ -296,6 +296,20 @@ def _refuse_flat_patch(camera: CameraEvidence) -> Verdict:
     return refuse(verification.FLAT_PATCH, (camera.name,), name=camera.name, percent=100 * camera.coverage)
 
 
+def check_small_parts(case: EvidenceCase) -> Verdict | None:
+    """Rejects a camera whose matches fill little of its picture, and contradict it in good part."""
+    config = case.config
+    small = [camera for camera in case.evidence.cameras if not camera.coverage >= config.small_part]
+    doubted = [camera for camera in small if not camera.inlier_ratio >= config.min_small_part_ratio]
+    if not doubted or len(case.evidence.cameras) == 2:
+        return None
+    return _refuse_small_part(min(doubted, key=lambda camera: camera.inlier_ratio))
+
+
+def _refuse_small_part(camera: CameraEvidence) -> Verdict:
+    return refuse(verification.SMALL_PART, (camera.name,), name=camera.name, percent=100 * camera.coverage)
+
+
 def check_own_lenses(case: EvidenceCase) -> Verdict | None:
     """A camera got a lens of its own, and its matches contradict it all the same, or it is that of a part."""
     inset = next((camera for camera in case.evidence.cameras if camera.inset), None)
@@ -595,9 +609,7 @@ def _refuse_wrong_poses(case: VerificationCase, against: str) -> Verdict:
     if against == "flat_patch":
         return _refuse_flat_patch(max(cameras, key=measure_flat_patch))
     if against == "coverage":
-        smallest = min(cameras, key=lambda camera: camera.coverage)
-        percent = 100 * smallest.coverage
-        return refuse(verification.SMALL_PART, (smallest.name,), name=smallest.name, percent=percent)
+        return _refuse_small_part(min(cameras, key=lambda camera: camera.coverage))
     if against in ("rotation_bound", "travel_bound"):
         return explain_wide_bounds(case)
     return _refuse_contradictions(case, against)
@@ -726,6 +738,7 @@ LIMITS = (  # each asks one piece of the evidence, and decides by itself
     check_connectivity,
     check_confirmed_points,
     check_flat_patch,
+    check_small_parts,
     check_own_lenses,
     check_mirrored_images,
     check_mirrored_scene,

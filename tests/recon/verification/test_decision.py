@@ -169,6 +169,13 @@ def test_a_camera_that_shares_one_small_flat_thing_is_refused_whatever_else_fits
     assert verdict(5, {3: {"coverage": 0.1, "flat_share": 0.7}}).publishable
 
 
+def test_a_camera_is_refused_whose_matches_fill_little_and_contradict_it():
+    given = refused(verdict(5, {3: {"coverage": 0.08, "inlier_ratio": 0.76}}), Code.AMBIGUOUS)
+    assert given.frames == names(3) and "fills only 8 % of its picture" in given.message
+    assert verdict(5, {3: {"coverage": 0.08, "inlier_ratio": 0.9}}).publishable
+    assert verdict(5, {3: {"coverage": 0.14, "inlier_ratio": 0.76}}).publishable
+
+
 def test_what_two_montages_share_is_no_scene():
     given = refused(verdict(2, shifted_share=0.97), Code.MOVING_SCENE)
     assert "97 %" in given.message and "montages" in given.message
