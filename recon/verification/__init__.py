@@ -40,9 +40,9 @@ class DecisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_flat_patch: Internal[float] = 0.6
     # Share of the matches that must agree with a camera that has a lens of its own; of 236 right answers 13 have less
     min_own_lens_ratio: Internal[float] = 0.85
-    # Of a camera beside two others or more whose matches fill less than such a share of its picture, as much of them
-    # must agree; the two published ones that had less were 12 and 18 degrees off
+    # Share of its picture that the matches of a camera beside two others or more must fill, where many contradict it
     small_part: Internal[float] = 0.1
+    # Share of such a camera's matches that must agree; the two published ones that had less were 12 and 18 degrees off
     min_small_part_ratio: Internal[float] = 0.82
     # Gain of a group of frames when mirrored; right answers reach 0.25, mirrored frames 1
     max_reflection: Internal[float] = 0.4

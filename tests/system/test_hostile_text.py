@@ -132,7 +132,7 @@ def test_what_a_verb_says_only_shows(tmp_path, monkeypatch, capsys, way, text):
 @pytest.mark.parametrize("text", TEXTS.values(), ids=TEXTS)
 def test_what_a_process_says_of_itself_only_shows(monkeypatch, capsys, text):
     fields = {"state": text, "why": text, text: text, "rss_mb": 1.0}
-    monkeypatch.setattr("splatnode.capture.cli.heartbeats", lambda network: {"capture": fields, "recon": None})
+    monkeypatch.setattr("splatnode.capture.cli.read_heartbeats", lambda network: {"capture": fields, "recon": None})
     assert_only_shows(said_by(["status"], capsys))
     assert ascii(json.loads(said_by(["status", "--json"], capsys))["capture"]) == ascii(fields)
     monkeypatch.setattr(node, "ask", lambda *_: node.Answer(False, f"no keyframe {text}"))
