@@ -201,17 +201,23 @@ DISTORTED = Refusal(
     "The lens bends the picture: its corners are {further:.0f} % further off than a straight lens puts them.",
     "Calibrate the camera and give the distortion coefficients, or remove the distortion before.",
 )
+UNKNOWN_FOCAL = Refusal(
+    Code.FOCAL_SUSPECT,
+    "The focal length is not known, which leaves the positions open to {centre:.0f} % of the distance to the scene and "
+    "the directions to {rotation:.0f} degrees.",
+    "Give the camera's calibration, or add photographs that look at the scene from other directions. Keep zoom and "
+    "focus as they are and do not crop.",
+)
 UNCERTAIN_FOCAL = Refusal(
     Code.FOCAL_SUSPECT,
     "The focal length is known to {focal:.0f} % only, which leaves the positions open to {centre:.0f} % of the "
     "distance to the scene and the directions to {rotation:.0f} degrees.",
-    "Give the camera's calibration, or add photographs that look at the scene from other directions. Keep zoom and "
-    "focus as they are and do not crop.",
+    UNKNOWN_FOCAL.advice,
 )
 MIXED_CAMERAS = Refusal(
     Code.MIXED_CAMERAS,
-    "{others} of {count} photographs {others:has|have} another size than most, and {others:its|their} lens cannot be "
-    "told.",
+    "{others} of {count} photographs {others:has|have} a size of {others:its|their} own, and {others:its|their} lens "
+    "cannot be told.",
     "Leave them out, give their calibration, or take all photographs with one camera, uncropped.",
 )
 APART = Refusal(
@@ -238,8 +244,8 @@ DISAGREEING = Refusal(
 )
 NO_COMMON_LENS = Refusal(
     Code.AMBIGUOUS,
-    "{own} of {count} photographs {own:does|do} not have the lens of the others, as after a zoom, a crop or a change "
-    "of focus, and with a lens for each the poses stay in doubt.",
+    "{own} of {count} photographs {own:does|do} not have the lens that all were taken to share, as after a zoom, a "
+    "crop or a change of focus, and with a lens for each the poses stay in doubt.",
     "Keep zoom and focus as they are and do not crop, or give the lens of each photograph by --intrinsics.",
 )
 UNFIT_LENS = Refusal(

@@ -394,11 +394,16 @@ def _check_planarity(case: VerificationCase) -> Verdict | None:
     )
 
 
+UNKNOWN_PERCENT = 100.0  # bound of a focal length from which on it is not known
+
+
 def _check_focal(case: VerificationCase) -> Verdict | None:
     worst = case.widest_bounds
     if worst.focal_percent <= case.config.exact_focal_percent:
         return None
     centre, rotation = worst.centre_percent, worst.rotation_deg
+    if worst.focal_percent >= UNKNOWN_PERCENT:
+        return refuse(verification.UNKNOWN_FOCAL, case.names, centre=centre, rotation=rotation)
     return refuse(verification.UNCERTAIN_FOCAL, case.names, focal=worst.focal_percent, centre=centre, rotation=rotation)
 
 

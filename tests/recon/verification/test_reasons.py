@@ -38,6 +38,7 @@ def turning(count: int) -> ViewGraph:
 
 WHATEVER_THE_ODDS = DecisionConfig(min_log_odds=-100.0)
 OPEN_FOCAL = Errors(0.5, 0.5, 0.5)
+ROUGH_FOCAL = Errors(0.06, 0.06, 0.06)
 
 
 @pytest.mark.parametrize(
@@ -47,7 +48,8 @@ OPEN_FOCAL = Errors(0.5, 0.5, 0.5)
         (turning, {"focal": OPEN_FOCAL}, Code.NO_PARALLAX, "a turn explains"),  # it leaves the focal length open, too
         (flat, {"focal": OPEN_FOCAL}, Code.PLANAR_ONLY, "one plane"),
         (flat, {"median_angle_deg": 2.0}, Code.BASELINE_TOO_SMALL, "under 2.0 degrees"),  # its focal length is known
-        (lambda n: graph(n, all_pairs(n)), {"focal": OPEN_FOCAL}, Code.FOCAL_SUSPECT, "focal length is known to"),
+        (lambda n: graph(n, all_pairs(n)), {"focal": OPEN_FOCAL}, Code.FOCAL_SUSPECT, "focal length is not known"),
+        (lambda n: graph(n, all_pairs(n)), {"focal": ROUGH_FOCAL}, Code.FOCAL_SUSPECT, "focal length is known to"),
         (lambda n: graph(n, all_pairs(n)), {"median_angle_deg": 2.0}, Code.BASELINE_TOO_SMALL, "under 2.0 degrees"),
         (lambda n: graph(n, all_pairs(n)), {}, Code.AMBIGUOUS, "disagree about 2.png"),
     ],

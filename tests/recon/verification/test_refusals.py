@@ -70,8 +70,8 @@ def test_an_entry_that_is_filled_in_is_a_verdict_without_a_scene():
 
 def test_verbs_agree_with_how_many_photographs_there_are():
     one, two = (refuse(verification.MIXED_CAMERAS, ["a.png"], others=others, count=5).message for others in (1, 2))
-    assert one == "1 of 5 photographs has another size than most, and its lens cannot be told."
-    assert two == "2 of 5 photographs have another size than most, and their lens cannot be told."
+    assert one == "1 of 5 photographs has a size of its own, and its lens cannot be told."
+    assert two == "2 of 5 photographs have a size of their own, and their lens cannot be told."
     one, two = (refuse(verification.MIRRORED_PHOTOGRAPHS, ["a.png"], count=count).message for count in (1, 2))
     assert one.startswith("1 photograph shows") and one.endswith("it matches the others better.")
     assert two.startswith("2 photographs show") and two.endswith("they match the others better.")
