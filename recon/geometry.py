@@ -233,6 +233,18 @@ def cross_matrix(vectors: Array) -> Array:
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3)
 
 
+def epipolar_errors(matrix: Array, points1: Array, points2: Array, least_slope: float = 1e-15) -> Array:
+    """(M,) signed Sampson errors of matches (both (M, 2)) under a fundamental or an essential matrix (3, 3).
+
+    They are in the points' unit. A smaller slope of the epipolar lines than `least_slope` counts as that, as at the
+    epipoles (Hartley and Zisserman, 2004, 11.4.3).
+    """
+    first, second = (np.column_stack([points, np.ones(len(points))]) for points in (points1, points2))
+    lines2, lines1 = first @ matrix.T, second @ matrix
+    squares = (lines1[:, :2] ** 2).sum(1) + (lines2[:, :2] ** 2).sum(1)
+    return (second * lines2).sum(1) / np.sqrt(np.maximum(squares, least_slope**2))
+
+
 def cross(one: Array, other: Array) -> Array:
     """(M, 3) cross products of rows (M, 3) with rows or with one vector (3,); numpy.cross takes five times as long."""
     a, b = one.T, other.T

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 
-from splatnode.recon.geometry import project
+from splatnode.recon.geometry import epipolar_errors, project
 
 # PoseLib's estimators by OpenCV's, for systems that PoseLib has no wheel for (Linux on aarch64).
 #
@@ -192,10 +192,7 @@ def _sampson(pose: Pose, rays1: Array, rays2: Array) -> Array:
     """(M,) Sampson errors at depth 1."""
     x, y, z = pose.t
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ pose.R
-    first, second = _homogeneous(rays1), _homogeneous(rays2)
-    line2, line1 = first @ essential.T, second @ essential
-    gradient = (line1[:, :2] ** 2).sum(1) + (line2[:, :2] ** 2).sum(1)
-    return np.abs((second * line2).sum(1)) / np.sqrt(np.maximum(gradient, 1e-30))
+    return np.abs(epipolar_errors(essential, rays1, rays2))
 
 
 def _errors_in_front(pose: Pose, rays1: Array, rays2: Array) -> Array:

@@ -24,6 +24,7 @@ import numpy.typing as npt
 
 from splatnode.capture.process.system import raise_shortage
 from splatnode.recon import poselib
+from splatnode.recon.geometry import epipolar_errors
 from splatnode.recon.keyframes import (
     LIBRARY_ERRORS,
     PLAIN,
@@ -46,9 +47,7 @@ _CONFIDENCE, _MAX_ITERATIONS = 0.9999, 10000
 _LOCAL_ITERATIONS, _LOCAL_SAMPLE = 10, 20  # of the local optimisation: rounds, and matches drawn in each
 _POLISHER_ITERATIONS = 10  # of the last refinement, in which all inliers count
 
-# Least squares for the fundamental matrix, of the matches that the one before explains
-_FUNDAMENTAL_REFITS = 5
-_LEAST_SLOPE = 1e-12  # of an epipolar line
+_FUNDAMENTAL_REFITS = 5  # by least squares, each to the matches that the matrix before explains
 
 # RANSAC for the shared focal length: its matches are inliers already, so that few iterations are enough.
 _FOCAL_ITERATIONS = {"min_iterations": 200, "max_iterations": 2000, "seed": 0}
@@ -103,17 +102,8 @@ class TwoView:
         return replace(self, points1=scale1 * self.points1, points2=scale2 * self.points2)
 
 
-def epipolar_errors(fundamental: Array, points1: Array, points2: Array) -> Array:
-    """(M,) Sampson errors of matches (both (M, 2)) under a fundamental matrix (3, 3), in their unit."""
-    ones = np.ones((len(points1), 1))
-    first, second = np.hstack([points1, ones]), np.hstack([points2, ones])
-    lines2, lines1 = first @ fundamental.T, second @ fundamental
-    slopes = np.hypot(np.linalg.norm(lines1[:, :2], axis=1), np.linalg.norm(lines2[:, :2], axis=1))
-    return np.abs((second * lines2).sum(1)) / np.maximum(slopes, _LEAST_SLOPE)
-
-
 def fit_epipolar_errors(pair: TwoView, zero_px: float) -> Array:
-    """(M,) Sampson errors of the matches under the fundamental matrix that fits them best, whatever the lenses are.
+    """(M,) sizes of the matches' Sampson errors under the fundamental matrix that fits them best, whatever the lenses.
 
     `zero_px`, in the matches' pixels, is the error from which on a match does not count. Infinite where none fits.
     """
@@ -122,7 +112,7 @@ def fit_epipolar_errors(pair: TwoView, zero_px: float) -> Array:
     for _ in range(_FUNDAMENTAL_REFITS):
         if matrix is None or matrix.shape != (3, 3):
             break
-        errors = epipolar_errors(np.asarray(matrix, np.float64), pair.points1, pair.points2)
+        errors = np.abs(epipolar_errors(np.asarray(matrix, np.float64), pair.points1, pair.points2))
         if count_explained(errors, zero_px) <= count_explained(best, zero_px):
             break
         best, near = errors, errors < zero_px

@@ -21,6 +21,7 @@ from splatnode.capture.masks import apply_mask
 from splatnode.capture.process.config import Internal
 from splatnode.capture.process.system import raise_shortage
 from splatnode.capture.process.terminal import ProgressStep, Tell
+from splatnode.recon.geometry import epipolar_errors
 from splatnode.recon.keyframes import (
     LIBRARY_ERRORS,
     REFERENCE_SIDE,
@@ -630,8 +631,8 @@ def _share_on_lines(geometry: pair_matching.TwoView, points1: Array, points2: Ar
     fundamental, _ = cv2.findFundamentalMat(geometry.points1, geometry.points2, cv2.FM_LMEDS)
     if fundamental is None or fundamental.shape != (3, 3):
         return 1.0  # nothing is known of what the geometry explains
-    errors = pair_matching.epipolar_errors(np.asarray(fundamental, np.float64), points1, points2)
-    return float((errors < threshold).mean())
+    errors = epipolar_errors(np.asarray(fundamental, np.float64), points1, points2)
+    return float((np.abs(errors) < threshold).mean())
 
 
 def _patch(points: Array, keyframe: Keyframe) -> float:

@@ -54,7 +54,7 @@ _QUICK_ITERATIONS, _QUICK_DECREASE = 10, 1e-3
 
 _MIN_IMPROVEMENT = 1.05  # factor of the score by which another model must be better to replace one
 _MIN_VIEWS = 3  # that must stay when doubtful ones are removed
-_FEW_VIEWS = 3  # whose lenses a model with a common one does not tell; of more it does
+_FEW_VIEWS = 3  # for which a lens each is tried: from a model with a common one, lenses of more views are found
 
 
 class IncrementalMapperConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -375,8 +375,8 @@ _AS_WELL, _NEARLY = 0.97, 0.9
 _FAR_FROM_TYPICAL = 0.5
 _FAR_FROM_VOTE = 0.3
 _HELD_SIGMA = 0.15  # of log focal, while such a focal length is held
+_OTHER_ATTEMPTS = 3  # first pairs that are tried with it, or with a lens for each view
 _APART = 0.1  # difference of log focals from which on views have a lens each
-_OTHER_ATTEMPTS = 3  # first pairs that are tried with it
 _UNEXPLAINED_BY_PLANE = 1.05  # less the planar share of a pair: above 1, so that a planar pair is better than none
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
-from splatnode.recon.geometry import cross_matrix
+from splatnode.recon.geometry import cross_matrix, epipolar_errors
 from splatnode.recon.keyframes import PLAIN, REFERENCE_SIDE, Features, Keyframe, longer_side, principal_point
 from splatnode.recon.matching import features as matching_features
 from splatnode.recon.matching.pair_matching import TwoView, find_components
@@ -36,6 +36,7 @@ MIN_SIGMA_DEG = 0.3  # of a direction: what lens and shutter do otherwise than t
 MIN_NOISE_PX = 0.2  # of a match, at REFERENCE_SIDE
 MEDIAN_OF_NORMAL = 0.6745  # median size of a normal error over its standard deviation
 OUTLIER = 4.0  # times the noise, from which on a match says nothing
+LEAST_SLOPE = 1e-6  # of an epipolar line, of rays at depth 1
 MIN_INFORMATION = 1e-9  # of an eigenvalue, in place of 0
 STEP = 1e-5  # of a rotation or a direction, radians, in differences
 
@@ -120,7 +121,7 @@ def estimate_direction_sigma_deg(
     def errors(step: Array) -> Array:
         turned = rotation + cross_matrix(step[None, :3])[0] @ rotation
         moved = unit + step[3] * aside[0] + step[4] * aside[1]
-        return _compute_sampson_errors(rays1, rays2, cross_matrix(moved[None])[0] @ turned)
+        return epipolar_errors(cross_matrix(moved[None])[0] @ turned, rays1, rays2, LEAST_SLOPE)
 
     at = errors(np.zeros(5))
     noise = max(float(np.median(np.abs(at))) / MEDIAN_OF_NORMAL, least_noise)
@@ -130,14 +131,6 @@ def estimate_direction_sigma_deg(
     values, vectors = np.linalg.eigh(information)
     covariance = (vectors / np.maximum(values, MIN_INFORMATION)) @ vectors.T
     return float(min(np.degrees(np.sqrt(np.trace(covariance[3:, 3:]))), 90.0))
-
-
-def _compute_sampson_errors(rays1: Array, rays2: Array, essential: Array) -> Array:
-    """(M,) signed, at depth 1."""
-    one, other = (np.column_stack([rays, np.ones(len(rays))]) for rays in (rays1, rays2))
-    line2, line1 = one @ essential.T, other @ essential
-    gradient = (line1[:, :2] ** 2).sum(1) + (line2[:, :2] ** 2).sum(1)
-    return (other * line2).sum(1) / np.sqrt(np.maximum(gradient, MIN_LENGTH))
 
 
 def _select_strongest_pairs(
