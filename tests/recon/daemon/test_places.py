@@ -48,11 +48,11 @@ __all__ = ["config", "peer"]
 NEVER_S = 1e6
 
 
-@pytest.fixture
 def is_lost(network):
     return read_heartbeats(network, only="recon")["recon"]["state"] == "lost"
 
 
+@pytest.fixture
 def moving(config):
     """A camera that never rests."""
     return replace(config, idle_finalize_s=NEVER_S)
