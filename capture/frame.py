@@ -370,6 +370,7 @@ COEFFICIENTS = {  # of each lens model: the most that it takes, and what they ar
 }
 SOURCES = ("exif", "given", "calibration", "estimated")
 _SMALLEST_FOCAL, _LARGEST_LENS = 1e-6, 1e9  # pixels, and the coefficients' size
+LARGEST_SKEW = 1.0  # of either sign: columns at 45 degrees
 
 
 @dataclass(frozen=True)
@@ -378,8 +379,10 @@ class Intrinsics:
 
     The centre of the top-left pixel is (0.5, 0.5), as in COLMAP. `distortion` are the coefficients of the lens'
     `model`: "opencv" (radial and tangential, k1 k2 p1 p2 ...; a pinhole where there are none) or "fisheye"
-    (equidistant, k1 k2 k3 k4). `source` tells where the numbers come from: "exif" (nominal, a few per cent),
-    "given" or "calibration" (trusted), "estimated" (by the reconstruction).
+    (equidistant, k1 k2 k3 k4). A picture with `skew` is sheared, as a rolling shutter in a turn or an editor leaves it:
+    distorted normalized coordinates (x, y) are seen at u = fx (x + skew y) + cx, v = fy y + cy. `source` tells where
+    the numbers come from: "exif" (nominal, a few per cent), "given" or "calibration" (trusted), "estimated" (by the
+    reconstruction).
     """
 
     width: int  # of the images that were calibrated, pixels
@@ -391,9 +394,10 @@ class Intrinsics:
     source: str  # calibration or given: the lens is trusted; exif: it is right to a few per cent
     distortion: tuple[float, ...] = ()  # of its model, as OpenCV's k1 k2 p1 p2 k3 ...; none: all are 0
     model: str = "opencv"  # of the lens: opencv (a pinhole where there are no coefficients), fisheye (k1 k2 k3 k4)
+    skew: float = 0.0  # how far a row moves across for one down, in normalized coordinates; of a fisheye 0
 
     def __post_init__(self) -> None:
-        lens = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        lens = (self.fx, self.fy, self.cx, self.cy, self.skew, *self.distortion)
         if min(self.width, self.height, self.fx, self.fy) <= 0 or not all(map(math.isfinite, lens)):
             raise ValueError(f"intrinsics must be finite, sizes and focal lengths above 0; got {self}")
         if max(self.width, self.height) > LARGEST_SIDE:
@@ -409,7 +413,13 @@ class Intrinsics:
                 f"distortion must be {what}, got {len(self.distortion)} numbers for the model {self.model}. "
                 "Calibrate with cv2.calibrateCamera, or cv2.fisheye.calibrate and model: fisheye."
             )
-        for name in ("width", "height", "fx", "fy", "cx", "cy"):  # NumPy's numbers, as of a K, go into no message
+        if abs(self.skew) > LARGEST_SKEW:
+            raise ValueError(f"the skew of intrinsics must be within {LARGEST_SKEW:g} of 0, got {self.skew:g}")
+        if self.skew and self.model == "fisheye":
+            raise ValueError(
+                f"the skew of intrinsics must be 0 for the model fisheye, which has none, got {self.skew:g}"
+            )
+        for name in ("width", "height", "fx", "fy", "cx", "cy", "skew"):  # no message takes NumPy's numbers, as of a K
             object.__setattr__(self, name, (int if name in ("width", "height") else float)(getattr(self, name)))
         object.__setattr__(self, "distortion", tuple(map(float, self.distortion)))
         if self.source not in SOURCES:
@@ -417,10 +427,10 @@ class Intrinsics:
 
     @property
     def K(self) -> npt.NDArray[np.float64]:  # (3, 3)
-        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+        return np.array([[self.fx, self.fx * self.skew, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def resized(self, width: int, height: int) -> Intrinsics:
-        """The same camera for its image resized to `width` x `height`."""
+        """The same camera for its image resized to `width` x `height`; the skew, in units of fx, stays as it is."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy

@@ -3,7 +3,8 @@
 OpenCV's radial-tangential lens has k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]]; without any it is a pinhole. The
 equidistant fisheye has four terms k1 k2 k3 k4, as OpenCV's `fisheye` has it: a ray at the angle t from the camera's
 axis meets the picture t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) focal lengths from the principal point (Kannala and
-Brandt, A Generic Camera Model and Calibration Method, 2006). Frames of a calibrated lens are resampled to the pinhole
+Brandt, A Generic Camera Model and Calibration Method, 2006). OpenCV's functions know no skew: it is added to the
+pixels that they give, and taken out of those that they get. Frames of a calibrated lens are resampled to the pinhole
 with square pixels that recon models; the one of a fisheye holds what it sees, as far as a pinhole can.
 """
 
@@ -44,13 +45,16 @@ def project_opencv(rays: Array, lens: Intrinsics) -> Array:
         seen, _ = cv2.projectPoints(
             rays[ahead] / rays[ahead, 2:], np.zeros(3), np.zeros(3), camera_matrix(lens), coefficients(lens)
         )
-        pixels[ahead] = seen[:, 0] + 0.5
+        seen = seen[:, 0]
+        seen[:, 0] += _skew_shift(seen[:, 1], lens)
+        pixels[ahead] = seen + 0.5
     return pixels
 
 
 def unproject_opencv(pixels: Array, lens: Intrinsics) -> Array:
     """(M, 3) unit rays of the camera's frame that meet pixels (M, 2), found by iteration."""
     points = np.ascontiguousarray(pixels[:, None] - 0.5)
+    points[..., 0] -= _skew_shift(points[..., 1], lens)
     at_depth_1 = cv2.undistortPoints(
         points, camera_matrix(lens), coefficients(lens), None, np.eye(3), np.eye(3), _CRITERIA
     )[:, 0]
@@ -66,8 +70,13 @@ def coefficients(lens: Intrinsics) -> Array:
 
 
 def camera_matrix(lens: Intrinsics) -> Array:
-    """K (3, 3) as OpenCV has it, with the centre of the top-left pixel at (0, 0)."""
-    return lens.K - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+    """K (3, 3) as OpenCV has it: with the centre of the top-left pixel at (0, 0), and without skew."""
+    return np.array([[lens.fx, 0.0, lens.cx - 0.5], [0.0, lens.fy, lens.cy - 0.5], [0.0, 0.0, 1.0]])
+
+
+def _skew_shift(rows: npt.NDArray[Any], lens: Intrinsics) -> npt.NDArray[Any]:
+    """How many pixels the skew moves to the right what is seen in `rows`; OpenCV's first row has its centre at 0."""
+    return lens.fx * lens.skew / lens.fy * (rows - (lens.cy - 0.5)) if lens.skew else np.zeros_like(rows)
 
 
 _BISECTIONS = 60  # of the angle: to the last bit of a double
@@ -192,13 +201,13 @@ _MAX_ROUND_TRIP_PX = 0.5  # from a border point to its ray and back: a model tha
 
 
 def undistort_frame(frame: Frame) -> Frame:
-    """The frame without its lens' distortion and with fx = fy; the frame itself where there is nothing to undo.
+    """The frame without its lens' distortion and skew, with fx = fy; the frame itself where there is nothing to undo.
 
     It has the same size in pixels and shows the largest rectangle without unseen corners, whose pixels would be
     invented. A fisheye's has as many pixels in another shape, and a mask where the fisheye saw nothing
-    (wide_pinhole.py). Its right image, if it has one, is taken the same way, since both have one lens. An aligned depth
+    (`wide_pinhole`). Its right image, if it has one, is taken the same way, since both have one lens. An aligned depth
     image keeps its pixels, and gets the lens that they were seen through. Raises
-    ValueError for coefficients that fold the picture over.
+    ValueError for coefficients that fold the picture over, and for a skew that leaves no rectangle.
     """
     if frame.right is None:
         return _undistort_single(frame)
@@ -219,13 +228,16 @@ def straighten_depth(frame: Frame) -> DepthImage | None:
 
 
 def is_resampled(frame: Frame) -> bool:
-    """Whether `undistort_frame` makes another picture of the frame: its lens is no pinhole with square pixels."""
+    """Whether `undistort_frame` makes another picture of the frame: its lens is no pinhole with square, upright pixels.
+
+    Any skew counts, since nothing that takes a pinhole reads one.
+    """
     given = frame.intrinsics
     return given is not None and (given.model == "fisheye" or not _is_square_pinhole(given))
 
 
 def _is_square_pinhole(given: Intrinsics) -> bool:
-    return not any(given.distortion) and abs(given.fx / given.fy - 1.0) < SQUARE_TOLERANCE
+    return not any(given.distortion) and not given.skew and abs(given.fx / given.fy - 1.0) < SQUARE_TOLERANCE
 
 
 def _undistort_single(frame: Frame) -> Frame:
@@ -250,6 +262,7 @@ def _undistort_single(frame: Frame) -> Frame:
         cx=frame.width / 2 - focal * (left + right) / 2,
         cy=frame.height / 2 - focal * (top + bottom) / 2,
         distortion=(),
+        skew=0.0,
     )
     columns, rows = cv2.initUndistortRectifyMap(
         camera_matrix(given),
@@ -259,6 +272,7 @@ def _undistort_single(frame: Frame) -> Frame:
         (frame.width, frame.height),
         cv2.CV_32FC1,
     )
+    columns += _skew_shift(rows, given)
     image = cv2.remap(frame.image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     mask = None if frame.mask is None else _remap_mask(frame.mask, columns, rows)
     return replace(frame, image=image.astype(np.uint8), intrinsics=pinhole, mask=mask)
@@ -295,7 +309,7 @@ def _undistort_fisheye(frame: Frame, given: Intrinsics) -> Frame:
 def _find_inner_rectangle(name: str, given: Intrinsics, coefficients: Array) -> tuple[float, float, float, float]:
     """Left, top, right and bottom, at depth 1, of the largest upright rectangle of rays that the picture has.
 
-    Raises ValueError where the distortion folds the picture over.
+    Raises ValueError where the distortion folds the picture over, and where the skew leaves no rectangle.
     """
     across, down = (np.linspace(0.0, side, _POINTS_A_SIDE) - 0.5 for side in (given.width, given.height))
     ends = [
@@ -304,6 +318,8 @@ def _find_inner_rectangle(name: str, given: Intrinsics, coefficients: Array) -> 
         np.stack([np.full_like(down, across[-1]), down], 1),
         np.stack([across, np.full_like(across, down[-1])], 1),
     ]
+    for side in ends:
+        side[:, 0] -= _skew_shift(side[:, 1], given)
     matrix = camera_matrix(given)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
     straight = [
@@ -318,7 +334,13 @@ def _find_inner_rectangle(name: str, given: Intrinsics, coefficients: Array) -> 
     left, top = float(straight[0][:, 0].max()), float(straight[1][:, 1].max())
     right, bottom = float(straight[2][:, 0].min()), float(straight[3][:, 1].min())
     plain = min(given.width / given.fx, given.height / given.fy)
-    if not error < _MAX_ROUND_TRIP_PX or min(right - left, bottom - top) < _MIN_SIDE * plain:
+    is_small = min(right - left, bottom - top) < _MIN_SIDE * plain
+    if is_small and given.skew and error < _MAX_ROUND_TRIP_PX:
+        raise ValueError(
+            f"{name}: without its skew of {given.skew:g} the picture of {given.width} x {given.height} pixels has no "
+            "upright rectangle that is large enough. Give the skew that it has, or the picture before it was sheared."
+        )
+    if is_small or not error < _MAX_ROUND_TRIP_PX:
         raise ValueError(
             f"{name}: distortion {given.distortion} folds the picture over at its border. "
             "Calibrate again, with the pattern in the corners of the picture too."

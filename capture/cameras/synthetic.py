@@ -82,7 +82,7 @@ def lens_of(config: Config) -> Intrinsics | None:
 def _bending_lens(config: Config) -> Intrinsics | None:
     """The lens of the photographs, where it bends lines; None for a pinhole."""
     lens = lens_of(config)
-    return lens if lens is not None and (lens.distortion or lens.model != "opencv") else None
+    return lens if lens is not None and (lens.distortion or lens.skew or lens.model != "opencv") else None
 
 
 def frame_name(index: int) -> str:

@@ -628,7 +628,8 @@ def _score_test_views(
     true = [scene.cameras[camera.name].T_world_camera for camera in estimated]
     true_to_estimated = align_cameras(np.stack(true), np.stack([camera.T_world_camera for camera in estimated]))
     scores, order = [], list(scene.paths)
-    for view in load_held_out_views(scene, split, cameras[0].lens, settings.longer_side):
+    lens = None if cameras[0].lens is None else replace(cameras[0].lens, skew=0.0)  # a skew is of one image alone
+    for view in load_held_out_views(scene, split, lens, settings.longer_side):
         name, whole, used, place = view.name, view.photograph, view.used, float(order.index(view.name))
         rows, columns = view.shown
         height, width = whole.shape[:2]
@@ -660,7 +661,7 @@ def _score_test_views(
         main = "best_gain" if settings.best_gain else "interpolated"
         shown = (with_rim * gains_of[main]).clamp(0.0, 1.0)
         show(name, truth, shown[rows, columns])
-        known = undistort_counts(cameras[0].lens, counts[name]) if name in counts else None
+        known = undistort_counts(lens, counts[name]) if name in counts else None
         own = _score_view(shown, whole, used, view.shown, networks, known)
         exposures = {main: _describe_exposure(own, gains_of[main], best)}
         for kind in EXPOSURES:

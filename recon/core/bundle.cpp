@@ -53,7 +53,7 @@ bool solve(const System& system, const std::vector<int>& kept, std::vector<doubl
 
 // The parameters of a bundle, to be kept and put back.
 struct State {
-    std::vector<double> rotations, translations, log_focals, radials, shifts, log_aspects, points;
+    std::vector<double> rotations, translations, log_focals, radials, shifts, log_aspects, skews, points;
     std::vector<double> set_rotations, set_translations, mount_rotations, mount_translations;
 
     explicit State(const Bundle& b)
@@ -63,6 +63,7 @@ struct State {
           radials(b.radials, b.radials + 2 * b.num_lenses),
           shifts(b.shifts, b.shifts + 2 * b.num_lenses),
           log_aspects(b.log_aspects, b.log_aspects + b.num_lenses),
+          skews(b.skews, b.skews + b.num_lenses),
           points(b.points, b.points + 3 * size_t(b.num_points)),
           set_rotations(b.set_rotations, b.set_rotations + 9 * b.num_sets),
           set_translations(b.set_translations, b.set_translations + 3 * b.num_sets),
@@ -76,6 +77,7 @@ struct State {
         std::copy(radials.begin(), radials.end(), b.radials);
         std::copy(shifts.begin(), shifts.end(), b.shifts);
         std::copy(log_aspects.begin(), log_aspects.end(), b.log_aspects);
+        std::copy(skews.begin(), skews.end(), b.skews);
         std::copy(points.begin(), points.end(), b.points);
         std::copy(set_rotations.begin(), set_rotations.end(), b.set_rotations);
         std::copy(set_translations.begin(), set_translations.end(), b.set_translations);
@@ -107,6 +109,7 @@ void move(const Bundle& bundle, const System& system, const std::vector<double>&
         const double* of_lens = &step[kPose * bundle.num_cameras + kLens * g];
         bundle.log_focals[g] += std::clamp(of_lens[0], -0.5, 0.5);
         bundle.log_aspects[g] += std::clamp(of_lens[5], -0.2, 0.2);
+        bundle.skews[g] += std::clamp(of_lens[6], -0.2, 0.2);
         for (int k = 0; k < 2; ++k) {
             bundle.radials[2 * g + k] += std::clamp(of_lens[1 + k], -0.2, 0.2);
             bundle.shifts[2 * g + k] += of_lens[3 + k];
@@ -151,7 +154,7 @@ CORE_API double core_bundle_adjust(const Bundle* bundle, int max_iterations, dou
 }
 
 // The normal matrix of all poses, lenses, frame sets and mounts with the points eliminated, without damping:
-// (6 C + 6 G + 6 S + 6 M) on a side.
+// (6 C + 7 G + 6 S + 6 M) on a side.
 CORE_API void core_bundle_information(const Bundle* bundle, double* matrix) {
     System system(*bundle);
     assemble(*bundle, 0.0, system);

@@ -12,19 +12,19 @@ namespace core {
 
 constexpr int kChunks = 16;          // of points, that are dealt with in parallel
 constexpr double kBehind = 1e6;      // squared pixels: the error of a point behind a camera
-constexpr int kPose = 6, kLens = 6;  // numbers of a camera's pose and of a lens
+constexpr int kPose = 6, kLens = 7;  // numbers of a camera's pose and of a lens
 constexpr int kOwn = kPose + kLens;  // parameters of an observation but its point
 
 // As splatnode.recon.registration.bundle_adjustment.Problem; observations ordered by point. Parameters are the cameras' poses (rotation
 // vector applied from the left, translation), then the lenses' (log focal, two radial, shift of the principal point, log
-// of the focal length down over that across).
+// of the focal length down over that across, skew).
 struct Bundle {
     double *rotations, *translations;                            // (C, 3, 3), (C, 3)
-    double *log_focals, *radials, *shifts, *log_aspects;         // (G,), (G, 2), (G, 2), (G,)
+    double *log_focals, *radials, *shifts, *log_aspects, *skews;  // (G,), (G, 2), (G, 2), (G,), (G,)
     double* points;                                              // (P, 3)
     const int32_t *lens_of_camera, *camera_of, *first_of_point;  // (C,), (O,), (P + 1,)
     const double* pixels;                                        // (O, 2)
-    // (G, 6) means of the lens parameters and their information (6 G, 6 G); a diagonal element of 0 fixes a parameter.
+    // (G, 7) means of the lens parameters and their information (7 G, 7 G); a diagonal element of 0 fixes a parameter.
     const double *prior_means, *prior_information;
     int32_t num_cameras, num_lenses, num_points, fixed_camera;  // fixed_camera -1: given poses hold all of them
     double robust_squared;
@@ -42,7 +42,7 @@ struct Bundle {
 };
 
 struct Projection {
-    double turned[3], in_camera[3], u, v, focal, aspect, squared_radius, residual[2], squared;
+    double turned[3], in_camera[3], u, v, focal, aspect, skew, squared_radius, residual[2], squared;
     double distortion, bend;  // 1 + k1 r^2 + k2 r^4, and its derivative by r^2
 };
 
@@ -59,11 +59,12 @@ static Projection project(const Bundle& bundle, int camera, const double* point,
     p.v = p.in_camera[1] / z;
     p.focal = std::exp(bundle.log_focals[lens]);
     p.aspect = std::exp(bundle.log_aspects[lens]);
+    p.skew = bundle.skews[lens];
     p.squared_radius = p.u * p.u + p.v * p.v;
     const double first = bundle.radials[2 * lens], second = bundle.radials[2 * lens + 1] * p.squared_radius;
     p.distortion = 1 + (first + second) * p.squared_radius;
     p.bend = first + 2 * second;
-    p.residual[0] = p.focal * p.distortion * p.u + bundle.shifts[2 * lens] - pixel[0];
+    p.residual[0] = p.focal * p.distortion * (p.u + p.skew * p.v) + bundle.shifts[2 * lens] - pixel[0];
     p.residual[1] = p.focal * p.aspect * p.distortion * p.v + bundle.shifts[2 * lens + 1] - pixel[1];
     p.squared = p.residual[0] * p.residual[0] + p.residual[1] * p.residual[1];
     return p;
@@ -71,15 +72,16 @@ static Projection project(const Bundle& bundle, int camera, const double* point,
 
 // What pulls the lenses' parameters: a Gaussian prior, under which lenses may depend on each other.
 struct LensPriors {
-    int size;                        // 6 G
-    std::vector<double> deviations;  // (6 G,) from the means
-    std::vector<double> pull;        // (6 G,) information times deviations: half the gradient
+    int size;                        // 7 G
+    std::vector<double> deviations;  // (7 G,) from the means
+    std::vector<double> pull;        // (7 G,) information times deviations: half the gradient
 
     explicit LensPriors(const Bundle& bundle)
         : size(kLens * bundle.num_lenses), deviations(size), pull(size, 0.0) {
         for (int g = 0; g < bundle.num_lenses; ++g) {
-            const double values[kLens] = {bundle.log_focals[g],    bundle.radials[2 * g],    bundle.radials[2 * g + 1],
-                                          bundle.shifts[2 * g], bundle.shifts[2 * g + 1], bundle.log_aspects[g]};
+            const double values[kLens] = {bundle.log_focals[g], bundle.radials[2 * g],    bundle.radials[2 * g + 1],
+                                          bundle.shifts[2 * g], bundle.shifts[2 * g + 1], bundle.log_aspects[g],
+                                          bundle.skews[g]};
             for (int k = 0; k < kLens; ++k)
                 deviations[kLens * g + k] = values[k] - bundle.prior_means[kLens * g + k];
         }
@@ -236,7 +238,7 @@ static double total_cost(const Bundle& bundle) {
     return cost + LensPriors(bundle).cost() + PosePriors(bundle).cost() + rig_cost(bundle);
 }
 
-// Derivatives of a residual (2) by its camera's pose and lens (12) and by its point (3), and its weight.
+// Derivatives of a residual (2) by its camera's pose and lens (13) and by its point (3), and its weight.
 struct Derivatives {
     double by_camera[2][kOwn], by_point[2][3], weight;
 };
@@ -246,11 +248,13 @@ static Derivatives differentiate(const Bundle& bundle, const Projection& p, int 
     const double z = std::abs(p.in_camera[2]) < 1e-9 ? 1e-9 : p.in_camera[2];
     const double focals[2] = {p.focal, p.focal * p.aspect};
     const double cross = 2 * p.bend * p.u * p.v;
+    const double across[2] = {p.distortion + 2 * p.bend * p.u * p.u, cross};
+    const double down[2] = {cross, p.distortion + 2 * p.bend * p.v * p.v};
     const double by_normalised[2][2] = {
-        {focals[0] * (p.distortion + 2 * p.bend * p.u * p.u), focals[0] * cross},
-        {focals[1] * cross, focals[1] * (p.distortion + 2 * p.bend * p.v * p.v)}};
+        {focals[0] * (across[0] + p.skew * down[0]), focals[0] * (across[1] + p.skew * down[1])},
+        {focals[1] * down[0], focals[1] * down[1]}};
     const double* rotation = bundle.rotations + 9 * camera;
-    const double normalised[2] = {p.u, p.v};
+    const double normalised[2] = {p.u + p.skew * p.v, p.v};
     for (int k = 0; k < 2; ++k) {
         const double* n = by_normalised[k];
         const double position[3] = {n[0] / z, n[1] / z, -(n[0] * p.u + n[1] * p.v) / z};
@@ -265,6 +269,7 @@ static Derivatives differentiate(const Bundle& bundle, const Projection& p, int 
         d.by_camera[k][9] = k == 0;
         d.by_camera[k][10] = k == 1;
         d.by_camera[k][11] = k == 1 ? d.by_camera[k][6] : 0.0;
+        d.by_camera[k][12] = k == 0 ? focals[0] * p.distortion * p.v : 0.0;
         for (int i = 0; i < 3; ++i)
             d.by_point[k][i] =
                 position[0] * rotation[i] + position[1] * rotation[3 + i] + position[2] * rotation[6 + i];

@@ -41,7 +41,7 @@ struct System {
     int size;                      // parameters
     std::vector<double> matrix;    // (size, size), lower triangle
     std::vector<double> gradient;  // (size,)
-    std::vector<double> spread;    // (O, 12, 3): (J_camera^T w J_point) (J_point^T w J_point)^-1
+    std::vector<double> spread;    // (O, 13, 3): (J_camera^T w J_point) (J_point^T w J_point)^-1
     std::vector<double> shift;     // (P, 3): (J_point^T w J_point)^-1 J_point^T w residual
     std::vector<Sums> sums;        // of each chunk
 

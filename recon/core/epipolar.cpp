@@ -10,6 +10,7 @@
 struct EpipolarPose {
     double rotation[9], translation[3];
     double focals[4], radials[4], shifts[4];  // across and down, of the first camera, then of the second
+    double skews[2];                          // across for one down, at depth 1
     double min_parallax;  // the sine of the angle between two rays from which on their order along each other is told
     int32_t undistort_iterations;
 };
@@ -19,8 +20,8 @@ namespace {
 
 // At depth 1, without distortion.
 inline void normalise(const EpipolarPose& pose, int camera, const double* pixel, double* ray) {
-    const double x = (pixel[0] - pose.shifts[2 * camera]) / pose.focals[2 * camera];
     const double y = (pixel[1] - pose.shifts[2 * camera + 1]) / pose.focals[2 * camera + 1];
+    const double x = (pixel[0] - pose.shifts[2 * camera]) / pose.focals[2 * camera] - pose.skews[camera] * y;
     ray[0] = x, ray[1] = y, ray[2] = 1;
     for (int i = 0; i < pose.undistort_iterations; ++i) {
         const double squared = ray[0] * ray[0] + ray[1] * ray[1];

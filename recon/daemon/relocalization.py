@@ -341,6 +341,12 @@ class FinalScene:
     snapshot: Snapshot
     keyframes: Sequence[Keyframe]
 
+    @property
+    def stream_lens(self) -> Intrinsics | None:
+        """The lens of further images: that of the last camera, without the skew, which is of that image alone."""
+        lens = self.snapshot.cameras[-1].lens
+        return None if lens is None else replace(lens, skew=0.0)
+
 
 class Watcher:
     def __init__(
@@ -378,7 +384,7 @@ class Watcher:
             if watched is None or message is None:
                 continue
             try:
-                image = undistort_image(decode_preview(message), watched.snapshot.cameras[-1].lens)
+                image = undistort_image(decode_preview(message), watched.stream_lens)
                 tracker = tracker or Tracker(
                     compute_landmarks(watched.snapshot, watched.keyframes, self._config), self._config
                 )

@@ -110,8 +110,10 @@ def _triangulate_points(graph: ViewGraph, registration: Registration) -> tuple[b
     problem = bundle_adjustment.make_empty_problem(
         rotations, translations, np.arange(count), log_focals, radials, shifts
     )
-    aspects = {camera.index: camera.aspect for camera in registration.cameras}
-    problem = replace(problem, log_aspects=np.log([aspects.get(index, 1.0) for index in range(count)]))
+    log_aspects, skews = np.zeros(count), np.zeros(count)
+    for camera in registration.cameras:
+        log_aspects[camera.index], skews[camera.index] = np.log(camera.aspect), camera.skew
+    problem = replace(problem, log_aspects=log_aspects, skews=skews)
     centred = [keyframe.features.points - principals[i] for i, keyframe in enumerate(graph.keyframes)]
     registered = [camera.index for camera in registration.cameras]
     every = multiview_geometry.build(centred, graph.pairs)
@@ -224,7 +226,10 @@ _SETTLED = pose_refinement.PoseSearchConfig(rounds=2)
 
 
 def measure_shears(graph: ViewGraph, registration: Registration) -> dict[str, float]:
-    """Measures the shears of registered images, by name, as `verification.measure_shear`; few points measure none."""
+    """Measures the shears of registered images, by name, as `verification.measure_shear`; few points measure none.
+
+    A skew that a camera has is no shear of its image.
+    """
     shears: dict[str, float] = {}
     times_seen = np.bincount(registration.observed_point, minlength=len(registration.points))
     for camera in registration.cameras:
@@ -237,8 +242,11 @@ def measure_shears(graph: ViewGraph, registration: Registration) -> dict[str, fl
         mine = mine[:: -(-len(mine) // _MOST_CONFIRMED)]
         count = len(mine)
         points, numbers = registration.points[registration.observed_point[mine]], np.arange(count)
+        pixels = registration.observed_pixels[mine] - principal_point(frame)
+        below = (registration.observed_pixels[mine, 1] - camera.principal[1]) / camera.aspect
+        pixels[:, 0] -= camera.skew * below
         known = Correspondences(
-            pixels=registration.observed_pixels[mine] - principal_point(frame),
+            pixels=pixels,
             feature_of=numbers,
             points=points,
             covariances=np.zeros((count, 3, 3)),

@@ -606,7 +606,7 @@ def make_depth_view(keyframe: Keyframe, registration: Registration, camera: Regi
     points = registration.points[mine] @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
     (fx, fy), (cx, cy) = camera.focals.tolist(), camera.principal.tolist()
     terms = (*camera.radial.tolist(), 0.0, 0.0) if camera.radial.any() else ()
-    lens = Intrinsics(frame.width, frame.height, fx, fy, cx, cy, "estimated", terms)
+    lens = Intrinsics(frame.width, frame.height, fx, fy, cx, cy, "estimated", terms, skew=camera.skew)
     return DepthView(keyframe.name, frame.camera_id, points, frame.depth, lens)
 
 

@@ -171,6 +171,7 @@ class MetricView:
     shift: Array  # (2,) of the principal point from the middle of the picture
     bound: float  # 95 % bound of the centre's error, in the scene's unit; 0 where none is known
     bound_deg: float = 0.0  # and of the orientation's, degrees
+    skew: float = 0.0  # how far a row moves across for one down, at depth 1
 
     @property
     def centre(self) -> Array:
@@ -180,6 +181,7 @@ class MetricView:
         """(M, 2) at depth 1 of pixels (M, 2) in a picture of this size."""
         side = max(width, height)
         distorted = ((pixels - np.array([width, height]) / 2.0) / side - self.shift) / self.focal
+        distorted = distorted - np.outer(distorted[:, 1], [self.skew, 0.0])
         return undistort_rays(distorted, self.radial)
 
     def project(self, points: Array, width: int, height: int) -> Array:
@@ -187,8 +189,9 @@ class MetricView:
         in_camera = (points - self.centre) @ self.T_world_camera[:3, :3]
         depth = np.where(in_camera[:, 2] > 0, in_camera[:, 2], np.nan)
         rays = in_camera[:, :2] / depth[:, None]
-        distorted = self.focal * distortion((rays**2).sum(1), self.radial)[:, None] * rays + self.shift
-        return max(width, height) * distorted + np.array([width, height]) / 2.0
+        distorted = distortion((rays**2).sum(1), self.radial)[:, None] * rays
+        sheared = distorted + np.outer(distorted[:, 1], [self.skew, 0.0])
+        return max(width, height) * (self.focal * sheared + self.shift) + np.array([width, height]) / 2.0
 
 
 def make_metric_views(snapshot: Snapshot) -> Mapping[str, MetricView]:
@@ -204,7 +207,7 @@ def make_metric_views(snapshot: Snapshot) -> Mapping[str, MetricView]:
         shift = (K[:2, 2] - size / 2.0) / side
         radial = np.array(radial_of(camera.lens))
         found[camera.name] = MetricView(
-            camera.T_world_camera, float(K[0, 0]) / side, radial, shift, *bounds[camera.name]
+            camera.T_world_camera, float(K[0, 0]) / side, radial, shift, *bounds[camera.name], float(K[0, 1] / K[0, 0])
         )
     landmarks = snapshot.landmarks
     if landmarks is None:
@@ -213,7 +216,7 @@ def make_metric_views(snapshot: Snapshot) -> Mapping[str, MetricView]:
     for index, name in enumerate(landmarks.names):
         if name in found:
             lens = float(lenses.focals[index]), lenses.radials[index], lenses.shifts[index]
-            found[name] = MetricView(landmarks.Ts_world_camera[index], *lens, *bounds[name])
+            found[name] = MetricView(landmarks.Ts_world_camera[index], *lens, *bounds[name], found[name].skew)
     return found
 
 

@@ -101,8 +101,8 @@ NO_RIG = RigConstraint(
 _RAYLEIGH_MEDIAN = 1.1774  # median length of a 2D error whose components have sigma 1: sqrt(2 log 2)
 _MIN_NOISE_PX = 0.05  # at REFERENCE_SIDE: no observation is believed to be better
 # Parameters of a pose (rotation vector, translation) and of a lens: log focal, two radial coefficients, shift of the
-# principal point (x, y), log aspect
-_POSE, _LENS = 6, 6
+# principal point (x, y), log aspect, skew
+_POSE, _LENS = 6, 7
 _MIN_OWN_SIGMA = 1e-6  # of a lens that shares all of a parameter with others: the prior's covariance must be regular
 _MIN_DEPTH = 1e-9  # in the problem's unit of length, in place of 0
 _BEHIND_PX = 1e3  # the error that the robust cost counts for a point behind its camera
@@ -173,6 +173,7 @@ class Problem:
     point_of: Index  # (O,)
     pixels: Array  # (O, 2) relative to the nominal principal point
     log_aspects: Array | None = None  # (G,) log of the focal length down over that across; None: pixels are square
+    skews: Array | None = None  # (G,) how far a row moves across for one down, at depth 1; None: none is sheared
     given: GivenPoses | None = None  # what holds the cameras; None: nothing, so that one of them is fixed
     rig: RigConstraint | None = None  # what ties cameras that took their images together; None: nothing
 
@@ -180,6 +181,11 @@ class Problem:
     def aspects(self) -> Array:
         """(G,) focal length down over that across."""
         return np.ones(len(self.log_focals)) if self.log_aspects is None else np.exp(self.log_aspects)
+
+    @property
+    def all_skews(self) -> Array:
+        """(G,) how far a row moves across for one down, at depth 1."""
+        return np.zeros(len(self.log_focals)) if self.skews is None else self.skews
 
 
 class BundleAdjustmentConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -200,7 +206,8 @@ class CommonLensPrior:
     """
 
     group_of: Index  # (G,)
-    sigmas: Array  # (G, 6) of the common values, equal within a group: log focal, radials, shifts (pixels), log aspect
+    # (G, 7) of the common values, equal within a group: log focal, radials, shifts (pixels), log aspect, skew
+    sigmas: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +215,7 @@ class LensTies:
     """The ties between lenses: the difference of their parameters has these sigmas around zero."""
 
     to: Index  # (G,) the lens that each is near; -1: none
-    sigmas: Array  # (G, 6) of the differences; 0: this parameter is not tied
+    sigmas: Array  # (G, 7) of the differences; 0: this parameter is not tied
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,29 +227,32 @@ class LensPrior:
     radial_sigmas: Array  # (G, 2) around zero
     shift_sigmas: Array  # (G,) pixels around the nominal principal point
     aspect_sigmas: Array | None = None  # (G,) of log aspect around zero; None: fixed
+    skew_sigmas: Array | None = None  # (G,) of skew around zero; None: fixed
     common: CommonLensPrior | None = None  # None: each lens is independent of the others, but for `ties`
     ties: LensTies | None = None
 
     @property
     def means(self) -> Array:
-        """(G, 6)"""
+        """(G, 7)"""
         return np.column_stack([self.log_focals, np.zeros((len(self.log_focals), _LENS - 1))])
 
     @property
     def own_sigmas(self) -> Array:
-        """(G, 6)"""
-        aspects = np.zeros(len(self.sigmas)) if self.aspect_sigmas is None else self.aspect_sigmas
-        return np.column_stack([self.sigmas, self.radial_sigmas, self.shift_sigmas, self.shift_sigmas, aspects])
+        """(G, 7)"""
+        fixed = np.zeros(len(self.sigmas))
+        aspects = fixed if self.aspect_sigmas is None else self.aspect_sigmas
+        skews = fixed if self.skew_sigmas is None else self.skew_sigmas
+        return np.column_stack([self.sigmas, self.radial_sigmas, self.shift_sigmas, self.shift_sigmas, aspects, skews])
 
     @property
     def free(self) -> npt.NDArray[np.bool_]:
-        """(G, 6) whether a parameter may change."""
+        """(G, 7) whether a parameter may change."""
         free = self.own_sigmas > 0
         return free if self.common is None else free | (self.common.sigmas > 0)
 
     @property
     def information(self) -> Array:
-        """(6 G, 6 G) the inverse of the prior's covariance; 0 where a parameter is fixed."""
+        """(7 G, 7 G) the inverse of the prior's covariance; 0 where a parameter is fixed."""
         own, free = self.own_sigmas, self.free
         count = len(own)
         if self.common is None:
@@ -263,7 +273,7 @@ class LensPrior:
 
     @staticmethod
     def _tie_information(ties: LensTies, free: npt.NDArray[np.bool_]) -> Array:
-        """(6 G, 6 G); one end of a tie may be fixed."""
+        """(7 G, 7 G); one end of a tie may be fixed."""
         information = np.zeros((free.size, free.size))
         for lens, k in zip(*np.nonzero((ties.to[:, None] >= 0) & (ties.sigmas > 0) & free), strict=True):
             own, other = _LENS * lens + k, _LENS * ties.to[lens] + k
@@ -311,13 +321,15 @@ def project(problem: Problem) -> tuple[Array, Array]:
     )
     normalised = in_camera[:, :2] / avoid_zero_depth(in_camera[:, 2:])
     bent = distortion((normalised**2).sum(1), problem.radials[lens])
-    return normalised * _focals(problem, lens) * bent[:, None] + problem.shifts[lens], in_camera[:, 2]
+    sheared = normalised + np.outer(problem.all_skews[lens] * normalised[:, 1], [1.0, 0.0])
+    return sheared * _focals(problem, lens) * bent[:, None] + problem.shifts[lens], in_camera[:, 2]
 
 
 def normalise(problem: Problem, camera: Index, pixels: Array) -> Array:
     """(M, 2) coordinates at depth 1, without distortion, of `pixels` (M, 2) of the cameras `camera` (M,)."""
     lens = problem.lens_of_camera[camera]
-    distorted = (pixels - problem.shifts[lens]) / _focals(problem, lens)
+    sheared = (pixels - problem.shifts[lens]) / _focals(problem, lens)
+    distorted = sheared - np.outer(problem.all_skews[lens] * sheared[:, 1], [1.0, 0.0])
     return undistort_rays(distorted, problem.radials[lens])
 
 
@@ -472,17 +484,15 @@ def _copy(problem: Problem) -> Problem:
         for name in ("rotations", "translations", "log_focals", "radials", "shifts", "points")
     }
     rig = None if problem.rig is None else problem.rig.copy()
-    return replace(problem, **parameters, log_aspects=np.log(problem.aspects), rig=rig)
+    return replace(problem, **parameters, log_aspects=np.log(problem.aspects), skews=problem.all_skews.copy(), rig=rig)
 
 
 class _Native(ctypes.Structure):
     """`Bundle` of recon/core/bundle.cpp."""
 
     _fields_ = (
-        *(
-            (name, ctypes.c_void_p)
-            for name in ("rotations", "translations", "log_focals", "radials", "shifts", "log_aspects", "points")
-        ),
+        *((name, ctypes.c_void_p) for name in ("rotations", "translations")),
+        *((name, ctypes.c_void_p) for name in ("log_focals", "radials", "shifts", "log_aspects", "skews", "points")),
         *((name, ctypes.c_void_p) for name in ("lens_of_camera", "camera_of", "first_of_point", "pixels")),
         *((name, ctypes.c_void_p) for name in ("prior_means", "prior_information")),
         *((name, ctypes.c_int32) for name in ("num_cameras", "num_lenses", "num_points", "fixed_camera")),
@@ -501,7 +511,7 @@ def _native(
     """The problem as the core reads it, and the arrays that it points into, which must live as long."""
     first = np.searchsorted(problem.point_of, np.arange(len(problem.points) + 1))
     log_aspects = np.zeros(len(problem.log_focals)) if problem.log_aspects is None else problem.log_aspects
-    lenses = (problem.log_focals, problem.radials, problem.shifts, log_aspects)
+    lenses = (problem.log_focals, problem.radials, problem.shifts, log_aspects, problem.all_skews)
     parameters = (problem.rotations, problem.translations, *lenses, problem.points)
     indices = (problem.lens_of_camera, problem.camera_of, first)
     observed = (problem.pixels, prior.means, config.noise_px**2 * prior.information)

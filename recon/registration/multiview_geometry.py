@@ -58,6 +58,7 @@ def sampson_errors(estimate: bundle_adjustment.Problem, views: tuple[int, int], 
         tuple(focals.ravel()),
         tuple(radials.ravel()),
         tuple(estimate.shifts[lenses].ravel()),
+        tuple(estimate.all_skews[lenses]),
         _MIN_PARALLAX_PX / focals.max(),
         undistort_iterations(radials),
     )
@@ -77,6 +78,7 @@ class _Pose(ctypes.Structure):
         ("focals", ctypes.c_double * 4),
         ("radials", ctypes.c_double * 4),
         ("shifts", ctypes.c_double * 4),
+        ("skews", ctypes.c_double * 2),
         ("min_parallax", ctypes.c_double),
         ("undistort_iterations", ctypes.c_int32),
     )

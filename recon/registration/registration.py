@@ -85,6 +85,7 @@ class RegisteredCamera:
     # (3, 3) of the centre, after the best similarity, in the frame and the squared unit of the world; NaN likewise
     centre_covariance: Array
     aspect: float = 1.0  # focal length down over that across
+    skew: float = 0.0  # how far a row moves across for one down, at depth 1
     own_lens: bool = False  # the lens that it was taken to share, or that was given, is refuted
     near_lens: int = -1  # the lens whose focal length it has to within `own_lenses.focal_sigma`; -1: its own alone
     displaced: bool = False  # the principal point is not where it was taken to be
@@ -97,7 +98,9 @@ class RegisteredCamera:
 
     def normalise(self, pixels: Array) -> Array:
         """(M, 2) coordinates at depth 1, without distortion, of `pixels` (M, 2) of the frame at full size."""
-        return undistort_rays((pixels - self.principal) / self.focals, np.tile(self.radial, (len(pixels), 1)))
+        rays = (pixels - self.principal) / self.focals
+        rays[:, 0] -= self.skew * rays[:, 1]
+        return undistort_rays(rays, np.tile(self.radial, (len(pixels), 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,6 +292,7 @@ def make_registration(
                 centre_sigma_rel=float(centre_sigmas[position]),
                 centre_covariance=covariances[position],
                 aspect=float(estimate.aspects[lens]),
+                skew=float(estimate.all_skews[lens]),
                 near_lens=self_calibration.find_common_lens(found.prior, int(lens), config.mapper.own_lenses),
                 displaced=bool(found.prior.shift_sigmas[lens] > _DISPLACED * sides[i]),
                 focal_sigma=float(focal_sigmas[i]),
@@ -401,10 +405,14 @@ def _add_own_lenses(
             continue
         scale = grouping.scales[camera.index]
         problem, first = self_calibration.add_lens(problem, first, camera.index, scale * camera.focal)
-        radials, shifts = first.estimate.radials.copy(), first.estimate.shifts.copy()
-        radials[-1] = camera.radial
+        known = first.estimate
+        radials, shifts, log_aspects, skews = (
+            values.copy() for values in (known.radials, known.shifts, np.log(known.aspects), known.all_skews)
+        )
+        radials[-1], log_aspects[-1], skews[-1] = camera.radial, np.log(camera.aspect), camera.skew
         shifts[-1] = scale * (camera.principal - principal_point(keyframes[camera.index].frame))
-        first = replace(first, estimate=replace(first.estimate, radials=radials, shifts=shifts))
+        known = replace(known, radials=radials, shifts=shifts, log_aspects=log_aspects, skews=skews)
+        first = replace(first, estimate=known)
     return problem, replace(first, registered=registered)
 
 
@@ -422,7 +430,7 @@ _DETAIL = 2  # times the modelled size: what is straightened, so that resampling
 def undistort_keyframes(graph: ViewGraph, registration: Registration) -> tuple[ViewGraph, Registration]:
     """Both, as if pinholes had taken the photographs whose lens bends lines enough to be sure of it (LEAST_SHIFT).
 
-    So are photographs whose pixels are not square.
+    So are photographs whose pixels are not square, and those that are sheared.
 
     Such a keyframe has its `lens`; its frame is at most twice as large as it is modelled. Observations beyond what it
     shows are left out. What came is returned where no lens is such, or one is estimated that folds its picture over.
@@ -430,7 +438,7 @@ def undistort_keyframes(graph: ViewGraph, registration: Registration) -> tuple[V
     lenses = {}
     for camera in registration.cameras:
         lens = _make_intrinsics(camera, graph.keyframes[camera.index].frame)
-        if abs(corner_shift(lens)) > LEAST_SHIFT or abs(camera.aspect - 1.0) > SQUARE_TOLERANCE:
+        if abs(corner_shift(lens)) > LEAST_SHIFT or max(abs(camera.aspect - 1.0), abs(camera.skew)) > SQUARE_TOLERANCE:
             lenses[camera.index] = lens
     if not lenses:
         return graph, registration
@@ -463,7 +471,12 @@ def apply_known_lenses(
             own = lens.resized(frame.width, frame.height)
             principal = np.array([own.cx, own.cy])
             camera = replace(
-                camera, focal=own.fx, aspect=own.fy / own.fx, principal=principal, radial=np.array(radial_of(own))
+                camera,
+                focal=own.fx,
+                aspect=own.fy / own.fx,
+                skew=own.skew,
+                principal=principal,
+                radial=np.array(radial_of(own)),
             )
         cameras.append(camera)
     return replace(registration, cameras=tuple(cameras))
@@ -514,7 +527,7 @@ def _make_intrinsics(camera: RegisteredCamera, frame: Frame) -> Intrinsics:
     cx, cy = (float(value) for value in camera.principal)
     radial = (*camera.radial.tolist(), 0.0, 0.0) if camera.radial.any() else ()
     fx, fy = (float(value) for value in camera.focals)
-    return Intrinsics(frame.width, frame.height, fx, fy, cx, cy, "estimated", radial)
+    return Intrinsics(frame.width, frame.height, fx, fy, cx, cy, "estimated", radial, skew=camera.skew)
 
 
 def _undistort_observations(keyframes: list[Keyframe], registration: Registration) -> Registration:
@@ -530,7 +543,7 @@ def _undistort_observations(keyframes: list[Keyframe], registration: Registratio
         pixels[own] = undistort_pixels(pixels[own], keyframe.lens, pinhole)
         inside[own] = np.all((pixels[own] >= 0) & (pixels[own] < (pinhole.width, pinhole.height)), axis=1)
         principal = np.array([pinhole.cx, pinhole.cy])
-        cameras.append(replace(camera, focal=pinhole.fx, principal=principal, radial=np.zeros(2), aspect=1.0))
+        cameras.append(replace(camera, focal=pinhole.fx, principal=principal, radial=np.zeros(2), aspect=1.0, skew=0.0))
     return replace(
         registration,
         cameras=tuple(cameras),

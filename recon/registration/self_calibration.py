@@ -172,6 +172,8 @@ def sizes_disagree(
         log_focals=estimate.log_focals[lens_of],
         radials=estimate.radials[lens_of],
         shifts=estimate.shifts[lens_of],
+        log_aspects=np.log(estimate.aspects)[lens_of],
+        skews=estimate.all_skews[lens_of],
     )
     sigmas = prior.sigmas[lens_of]
     free = bundle_adjustment.LensPrior(
@@ -201,7 +203,7 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-_FOCAL, _RADIAL, _SHIFT, _ASPECT = 0, 1, slice(3, 5), 5  # columns of the parameters of a lens
+_FOCAL, _RADIAL, _SHIFT, _ASPECT, _SKEW = 0, 1, slice(3, 5), 5, 6  # columns of the parameters of a lens
 _ROUNDS = 8  # of adjustments, each under the prior that the one before gave
 _OWN_SIGMA = 0.5  # of log focal, of a lens whose focal length was refuted
 _NEGLIGIBLE = 1e-6  # a sigma below it is 0
@@ -219,12 +221,15 @@ class OwnLensesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     focal_sigma: float = 0.004  # of log focal
     shift_sigma: float = 0.0015  # of the principal point, as a share of the longer side
     radial_sigma: float = 0.01  # of the first radial coefficient
+    own_aspect_sigma: float = 0.001  # of the log aspect
+    skew_sigma: float = 0.001  # of the skew: how far a row moves across for one down, in focal lengths
     aspect_sigma: float = 0.003  # of the log aspect that all images of a group have in common
     # The same where the search for deviations begins, in which all of them are free
     widest_focal: float = 0.3  # of log focal
     widest_shift: float = 0.1  # of the principal point, as a share of the longer side
     widest_radial: float = 0.1  # of the first radial coefficient
-    widest_aspect: float = 0.3  # of the log aspect that all images of a group have in common
+    widest_skew: float = 0.1  # of the skew: how far a row moves across for one down, in focal lengths
+    widest_aspect: float = 0.3  # of the log aspect, both of an image and of what all images of a group have in common
     # A deviation of at least so many standard errors stays
     refuted_at: float = 4.25
     # Of what all images have in common where it is given: calibrations differ by as much
@@ -242,9 +247,9 @@ class PerViewLensModel:
 
     estimate: bundle_adjustment.Problem  # with C lenses, one a view
     prior: bundle_adjustment.LensPrior  # of these
-    stays: Flags  # (C, 6) deviations from the common lens that stay
-    widths: Array  # (C, 6) of the deviations of a group many of whose views refute that it has this in common; else 0
-    common: Array  # (C, 6) the common parameters of the group of each view
+    stays: Flags  # (C, 7) deviations from the common lens that stay
+    widths: Array  # (C, 7) of the deviations of a group many of whose views refute that it has this in common; else 0
+    common: Array  # (C, 7) the common parameters of the group of each view
     displaced: Flags  # (C,) views of groups whose common principal point or aspect is not what it was taken for
 
     @property
@@ -269,8 +274,9 @@ def free_lenses(
     groups, registered = partial.estimate.lens_of_camera, np.zeros(len(problem.views), bool)
     registered[list(partial.registered)] = True
     shared = np.bincount(groups[registered], minlength=len(partial.prior.sigmas)) > 1
-    floors = _sigmas(config.focal_sigma, config.shift_sigma, config.radial_sigma, sides)
-    own = _sigmas(config.widest_focal, config.widest_shift, config.widest_radial, sides)
+    floors = _narrowest_own(sides, config)
+    widest = config.widest_focal, config.widest_shift, config.widest_radial
+    own = _sigmas(*widest, sides, config.widest_aspect, config.widest_skew)
     own[~shared[groups]] = 0.0  # of a lens with one view there is nothing to deviate from
     least = _least_common(partial.prior, groups, sides, config)
     common = np.maximum(least, _sigmas(0.0, config.widest_shift, 0.0, sides, config.widest_aspect))
@@ -307,7 +313,7 @@ def free_lenses(
 
 
 def _widths(stays: Flags, sizes: Array, groups: Index, registered: Flags, calibrated: Flags) -> Array:
-    """(C, 6) the RMS deviation of a view's group in a parameter that many of its views refute; 0 where few do."""
+    """(C, 7) the RMS deviation of a view's group in a parameter that many of its views refute; 0 where few do."""
     widths = np.zeros_like(sizes)
     for group in np.unique(groups[registered]):
         (members,) = np.nonzero((groups == group) & registered)
@@ -339,7 +345,7 @@ def split_lenses(
     own = np.maximum(freed.prior.own_sigmas[views], np.abs(of_views))
     own[:, _FOCAL] = _OWN_SIGMA
     sides = np.array([problem.views[view].longer_side for view in views], np.float64)
-    floors = _sigmas(config.focal_sigma, config.shift_sigma, config.radial_sigma, sides, config.aspect_sigma)
+    floors = _narrowest_own(sides, config)
     values, sigmas = np.concatenate([common, of_views]), np.concatenate([sigmas, own])
     estimate = replace(
         found,
@@ -348,6 +354,7 @@ def split_lenses(
         radials=values[:, 1:3],
         shifts=values[:, _SHIFT],
         log_aspects=values[:, _ASPECT],
+        skews=values[:, _SKEW],
     )
     known = partial.prior.ties
     to, tied = (np.full(len(common), -1), np.zeros_like(common)) if known is None else (known.to, known.sigmas)
@@ -362,6 +369,7 @@ def split_lenses(
         radial_sigmas=sigmas[:, 1:3],
         shift_sigmas=sigmas[:, 3],
         aspect_sigmas=sigmas[:, _ASPECT],
+        skew_sigmas=sigmas[:, _SKEW],
         ties=ties,
     )
     lenses = [*problem.lenses, *(Lens((float(np.exp(focal)),), _OWN_SIGMA) for focal in of_views[:, _FOCAL])]
@@ -417,7 +425,7 @@ def widen_lens_priors(
     """
     lenses = problem.lens_of_camera
     common = prior.own_sigmas[lenses]
-    floors = _sigmas(config.focal_sigma, config.shift_sigma, config.radial_sigma, sides)
+    floors = _narrowest_own(sides, config)
     if prior.ties is None:
         groups, tied = lenses, floors
     else:
@@ -442,19 +450,26 @@ def expand_lenses(estimate: bundle_adjustment.Problem) -> bundle_adjustment.Prob
         radials=estimate.radials[groups],
         shifts=estimate.shifts[groups],
         log_aspects=np.log(estimate.aspects)[groups],
+        skews=estimate.all_skews[groups],
     )
 
 
-def _sigmas(focal: float, shift: float, radial: float, sides: Array, aspect: float = 0.0) -> Array:
-    """(C, 6)"""
-    sigmas = np.zeros((len(sides), 6))
+def _narrowest_own(sides: Array, config: OwnLensesConfig) -> Array:
+    """(C, 7) sigmas of the deviations of images that nothing tells to have a lens of their own."""
+    lens = config.focal_sigma, config.shift_sigma, config.radial_sigma
+    return _sigmas(*lens, sides, config.own_aspect_sigma, config.skew_sigma)
+
+
+def _sigmas(focal: float, shift: float, radial: float, sides: Array, aspect: float = 0.0, skew: float = 0.0) -> Array:
+    """(C, 7)"""
+    sigmas = np.zeros((len(sides), 7))
     sigmas[:, _FOCAL], sigmas[:, _RADIAL], sigmas[:, _SHIFT] = focal, radial, (shift * sides)[:, None]
-    sigmas[:, _ASPECT] = aspect
+    sigmas[:, _ASPECT], sigmas[:, _SKEW] = aspect, skew
     return sigmas
 
 
 def _least_common(prior: bundle_adjustment.LensPrior, groups: Index, sides: Array, config: OwnLensesConfig) -> Array:
-    """(C, 6) sigmas of what the views of a group have in common, where nothing speaks against what is known of it."""
+    """(C, 7) sigmas of what the views of a group have in common, where nothing speaks against what is known of it."""
     least = _sigmas(config.calibrated_focal, config.calibrated_shift, 0.0, sides, config.aspect_sigma)
     return np.maximum(prior.own_sigmas[groups], least)
 
@@ -468,19 +483,21 @@ def _prior(
         radial_sigmas=own[:, 1:3],
         shift_sigmas=own[:, 3],
         aspect_sigmas=own[:, _ASPECT],
+        skew_sigmas=own[:, _SKEW],
         common=bundle_adjustment.CommonLensPrior(groups, common),
     )
 
 
 def _parameters(estimate: bundle_adjustment.Problem) -> Array:
-    """(G, 6)"""
-    return np.column_stack([estimate.log_focals, estimate.radials, estimate.shifts, np.log(estimate.aspects)])
+    """(G, 7)"""
+    shapes = np.log(estimate.aspects), estimate.all_skews
+    return np.column_stack([estimate.log_focals, estimate.radials, estimate.shifts, *shapes])
 
 
 def _common_parameters(
     estimate: bundle_adjustment.Problem, prior: bundle_adjustment.LensPrior, registered: Flags
 ) -> Array:
-    """(C, 6) the most likely common parameters of each view's group."""
+    """(C, 7) the most likely common parameters of each view's group."""
     if prior.common is None:
         raise ValueError("the prior must have common parameters")
     values, means, own, common = _parameters(estimate), prior.means, prior.own_sigmas, prior.common.sigmas
@@ -495,7 +512,7 @@ def _common_parameters(
 
 
 def _pool_deviations(deviations: Array) -> Array:
-    """(C, 6) sizes of the deviations; both coordinates of a principal point count as one."""
+    """(C, 7) sizes of the deviations; both coordinates of a principal point count as one."""
     sizes = np.abs(deviations)
     sizes[:, _SHIFT] = np.sqrt((deviations[:, _SHIFT] ** 2).mean(1))[:, None]
     return sizes
@@ -535,6 +552,7 @@ def add_lens(
         radials=np.vstack([before.radials, np.zeros((1, 2))]),
         shifts=np.vstack([before.shifts, np.zeros(2) if shift is None else shift]),
         log_aspects=np.append(np.log(before.aspects), 0.0),
+        skews=np.append(before.all_skews, 0.0),
     )
     prior = bundle_adjustment.LensPrior(
         log_focals=np.append(prior.log_focals, np.log(focal)),
@@ -542,9 +560,10 @@ def add_lens(
         radial_sigmas=np.vstack([prior.radial_sigmas, np.zeros((1, 2))]),
         shift_sigmas=np.append(prior.shift_sigmas, widest_shift),
         aspect_sigmas=None if prior.aspect_sigmas is None else np.append(prior.aspect_sigmas, 0.0),
+        skew_sigmas=None if prior.skew_sigmas is None else np.append(prior.skew_sigmas, 0.0),
         ties=None
         if prior.ties is None
-        else bundle_adjustment.LensTies(np.append(prior.ties.to, -1), np.vstack([prior.ties.sigmas, np.zeros((1, 6))])),
+        else bundle_adjustment.LensTies(np.append(prior.ties.to, -1), np.vstack([prior.ties.sigmas, np.zeros((1, 7))])),
     )
     views = tuple(replace(each, lens=number) if index == view else each for index, each in enumerate(problem.views))
     own = Lens((focal,), _OWN_SIGMA, widest_shift=widest_shift)

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from splatnode.capture.frame import Intrinsics
 from splatnode.recon.geometry import Similarity, align_cameras, multiply_quats, quat_from_matrix, transform_to_camera
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
@@ -211,7 +212,7 @@ def replace_images(scene: Scene, graph: ViewGraph) -> Scene | None:
     keyframes, views = {keyframe.name: keyframe for keyframe in graph.keyframes}, []
     for view in scene.views:
         keyframe = keyframes.get(view.name)
-        if keyframe is None or abs(corner_shift(keyframe.lens) - corner_shift(view.lens)) > MAX_LENS_SHIFT:
+        if keyframe is None or _compute_corner_distance(keyframe.lens, view.lens) > MAX_LENS_SHIFT:
             return None
         if keyframe.lens is not None:
             lit = view.exposure
@@ -221,6 +222,12 @@ def replace_images(scene: Scene, graph: ViewGraph) -> Scene | None:
             view = replace(view, image=image, exposure=exposure, mask=keyframe.mask, lens=keyframe.lens)
         views.append(view)
     return replace(scene, views=tuple(views))
+
+
+def _compute_corner_distance(one: Intrinsics | None, other: Intrinsics | None) -> float:
+    """How far apart two lenses show a corner by their distortion and skew, over the longer side, at most."""
+    skews = [0.0 if lens is None else lens.skew for lens in (one, other)]
+    return abs(corner_shift(one) - corner_shift(other)) + 0.5 * abs(skews[0] - skews[1])
 
 
 def update_pointmaps(

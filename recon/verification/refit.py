@@ -26,7 +26,8 @@ FREE_SHIFT = (
     self_calibration.LensGroupingConfig().free_shift_sigma
 )  # of the longer side, of a principal point that was displaced
 FREE_ASPECT = 0.1  # of log aspect, where pixels are not square
-SQUARE = 1e-3  # difference of an aspect from 1 from which on they are not
+FREE_SKEW = 0.05  # where a picture is sheared
+SQUARE = 1e-3  # difference of an aspect from 1, or a skew, from which on they are not
 ROBUST_FACTOR = 3.0  # width of the Cauchy loss over the median error
 ROBUST_PX = (0.4, 1.5)  # least and most width of the Cauchy loss, pixels at REFERENCE_SIDE
 MIN_COST = 1e-12  # pixels squared: a smaller cost counts as this one where ratios are taken; made-up data have none
@@ -86,7 +87,8 @@ def build_fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_
     count, largest = len(numbers), sides.max()
     units = np.array([sides[lens_of_camera == lens].max() for lens in range(count)]) / largest
     enlarged = largest / sides
-    focals, aspects, radials, sigmas = np.zeros(count), np.zeros(count), np.zeros((count, 2)), np.zeros(count)
+    focals, aspects, skews, sigmas = (np.zeros(count) for _ in range(4))
+    radials, skew_sigmas = np.zeros((count, 2)), np.zeros(count)
     given_focals, nominal = np.full(count, np.nan), np.full(count, np.inf)
     shift_sigmas, aspect_sigmas, own = np.zeros(count), np.zeros(count), np.zeros(count, bool)
     near = np.full(count, -1)
@@ -100,6 +102,8 @@ def build_fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_
         shift_sigmas[lens] = FREE_SHIFT * largest if camera.displaced else 0.0
         stretched = abs(camera.aspect - 1.0) > SQUARE
         aspect_sigmas[lens] = max(FREE_ASPECT, abs(np.log(camera.aspect))) if stretched else 0.0
+        skews[lens] = camera.skew
+        skew_sigmas[lens] = max(FREE_SKEW, abs(camera.skew)) if abs(camera.skew) > SQUARE else 0.0
         own[lens], near[lens] = camera.own_lens, camera.near_lens
     principal = np.stack([camera.principal for camera in cameras])
     Ts_camera_world: Array = np.linalg.inv(np.stack([camera.T_world_camera for camera in cameras])).astype(np.float64)
@@ -116,6 +120,7 @@ def build_fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_
         point_of=np.searchsorted(kept, registration.observed_point[observed]),
         pixels=(enlarged[camera_of, None] * (registration.observed_pixels - principal[camera_of]))[observed],
         log_aspects=np.log(aspects),
+        skews=skews,
     )
     scale = float(largest) / REFERENCE_SIDE
     is_nominal = np.isfinite(nominal)
@@ -126,6 +131,7 @@ def build_fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_
         radial_sigmas=np.zeros((count, 2)),
         shift_sigmas=shift_sigmas,
         aspect_sigmas=aspect_sigmas,
+        skew_sigmas=skew_sigmas,
         ties=_tie_near_lenses(numbers, near),
     )
     errors = bundle_adjustment.reprojection_errors(problem)
@@ -141,7 +147,7 @@ def build_fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_
 
 def _tie_near_lenses(numbers: Index, near: Index) -> bundle_adjustment.LensTies | None:
     """Ties the focal lengths of lenses that are near one lens to that one, or to the first of them."""
-    to, sigmas = np.full(len(numbers), -1), np.zeros((len(numbers), 6))
+    to, sigmas = np.full(len(numbers), -1), np.zeros((len(numbers), 7))
     for common in np.unique(near[near >= 0]):
         (members,) = np.nonzero(near == common)
         (itself,) = np.nonzero(numbers == common)
@@ -507,6 +513,8 @@ def free_principal_points(fit: BundleFit) -> CameraShifts | None:
 # move with such lenses.
 
 DOUBTED_FOCAL = 0.1  # sigma of log focal by which an image's lens may differ from the common one
+DOUBTED_ASPECT = 0.003  # sigma of the log aspect by which an image may differ from the common one
+DOUBTED_SKEW = 0.001  # sigma of the skew of an image
 DOUBTED_SHIFT = 0.1  # sigma of the common principal point, of the longer side
 # The same where observations may ask for it themselves: keystone corrections of long lenses shift by as much
 FARTHEST_SHIFT = 0.3
@@ -541,7 +549,12 @@ def _doubt_lenses(
 ) -> tuple[bundle_adjustment.Problem, bundle_adjustment.LensPrior]:
     """The bundle adjusted with a lens for each camera, and the prior; `shift_sigma` is of the longer side."""
     count, side = len(whole.problem.rotations), REFERENCE_SIDE * whole.scale
-    config = msgspec.structs.replace(self_calibration.OwnLensesConfig(), focal_sigma=DOUBTED_FOCAL)
+    config = msgspec.structs.replace(
+        self_calibration.OwnLensesConfig(),
+        focal_sigma=DOUBTED_FOCAL,
+        own_aspect_sigma=DOUBTED_ASPECT,
+        skew_sigma=DOUBTED_SKEW,
+    )
     shared = np.bincount(whole.problem.lens_of_camera, minlength=len(whole.prior.sigmas)) > 1
     shifts = np.maximum(whole.prior.shift_sigmas, np.where(shared | whole.own, shift_sigma * side, 0.0))
     prior = replace(whole.prior, shift_sigmas=shifts)

@@ -1,6 +1,7 @@
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -21,10 +22,11 @@ def test_what_no_lens_can_have_is_refused(change):
         replace(Intrinsics(640, 480, 500.0, 510.0, 320.0, 236.0, source="given"), **change)
 
 
-def test_resizing_keeps_where_a_ray_meets_the_image():
+@pytest.mark.parametrize("skew", [0.0, 0.05])
+def test_resizing_keeps_where_a_ray_meets_the_image(skew):
     # With the top-left pixel's centre at (0.5, 0.5), image coordinates scale without an offset.
     ray = np.array([0.3, -0.2, 1.0])
-    intrinsics = Intrinsics(640, 480, 500.0, 510.0, 320.0, 236.0, source="given")
+    intrinsics = Intrinsics(640, 480, 500.0, 510.0, 320.0, 236.0, source="given", skew=skew)
     before, after = intrinsics.K @ ray, intrinsics.resized(960, 360).K @ ray
     assert np.allclose(after[:2], before[:2] * [1.5, 0.75])
 
@@ -78,6 +80,35 @@ def test_what_keeps_no_bounds_is_no_frame_and_is_left_out_with_the_reason(change
         assert rename_frame(Frame(**good), **kept) == dropped
 
 
+def test_K_of_a_skew():
+    intrinsics = Intrinsics(640, 480, 500.0, 510.0, 320.0, 236.0, "estimated", skew=0.1)
+    assert np.array_equal(intrinsics.K, [[500, 50, 320], [0, 510, 236], [0, 0, 1]])
+    assert intrinsics.resized(1280, 240).skew == 0.1
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"skew": 1.5}, "the skew of intrinsics must be within 1 of 0, got 1.5"),
+        ({"skew": -1.01}, "the skew of intrinsics must be within 1 of 0, got -1.01"),
+        ({"skew": math.nan}, "intrinsics must be finite"),
+        ({"skew": 0.1, "model": "fisheye"}, "must be 0 for the model fisheye, which has none, got 0.1"),
+    ],
+    ids=str,
+)
+def test_a_skew_that_cannot_be_is_named(change, said):
+    with pytest.raises(ValueError, match=said):
+        replace(Intrinsics(640, 480, 500.0, 510.0, 320.0, 236.0, source="estimated"), **change)
+
+
+def test_a_lens_with_skew_is_the_same_after_it_was_stored_and_one_stored_before_has_none():
+    lens = Intrinsics(640, 480, 500.0, 510.0, 320.0, 236.0, "estimated", (0.1, 0.0, 0.0, 0.0), skew=0.05)
+    assert msgspec.msgpack.decode(msgspec.msgpack.encode(lens), type=Intrinsics) == lens
+    assert msgspec.json.decode(msgspec.json.encode(lens), type=Intrinsics) == lens
+    before = {name: value for name, value in asdict(lens).items() if name != "skew"}
+    assert msgspec.convert(before, Intrinsics) == replace(lens, skew=0.0)
+
+
 def test_frame_size():
     frame = Frame(0, "a.jpg", 0, np.zeros((4, 5, 3), np.uint8), None)
     assert (frame.width, frame.height) == (5, 4)
@@ -86,6 +117,7 @@ def test_frame_size():
 def test_intrinsics_of_numpy_numbers_are_plain_ones():
     """As of a matrix K: no message takes NumPy's."""
     K = np.array([[500.0, 0, 320], [0, 501.0, 240], [0, 0, 1]])
-    made = Intrinsics(np.int64(640), np.int64(480), K[0, 0], K[1, 1], K[0, 2], K[1, 2], "given", tuple(np.zeros(4)))
-    numbers = made.width, made.height, made.fx, made.fy, made.cx, made.cy, *made.distortion
-    assert [type(number) for number in numbers] == [int, int, *[float] * 8]
+    sides, terms = (np.int64(640), np.int64(480)), tuple(np.zeros(4))
+    made = Intrinsics(*sides, K[0, 0], K[1, 1], K[0, 2], K[1, 2], "given", terms, skew=K[0, 1])
+    numbers = made.width, made.height, made.fx, made.fy, made.cx, made.cy, made.skew, *made.distortion
+    assert [type(number) for number in numbers] == [int, int, *[float] * 9]

@@ -168,10 +168,11 @@ void bundle(Draw& draw) {
         for (int i = 0; i < 3; ++i) rotations[9 * size_t(camera) + 4 * i] += 1;
     auto focals = draw.numbers(lenses, 2), radials = draw.numbers(2 * size_t(lenses), 0.1);
     auto shifts = draw.numbers(2 * size_t(lenses)), aspects = draw.numbers(lenses, 0.1);
-    auto places = draw.numbers(3 * size_t(points), 3), means = draw.numbers(6 * size_t(lenses));
+    auto skews = draw.numbers(lenses, 0.1);
+    auto places = draw.numbers(3 * size_t(points), 3), means = draw.numbers(7 * size_t(lenses));
     const auto pixels = draw.numbers(2 * camera_of.size(), 300);
-    std::vector<double> information(36 * size_t(lenses) * lenses);
-    for (int k = 0; k < 6 * lenses; ++k) information[size_t(k) * 6 * lenses + k] = draw.whole(0, 2) * 10.0;
+    std::vector<double> information(49 * size_t(lenses) * lenses);
+    for (int k = 0; k < 7 * lenses; ++k) information[size_t(k) * 7 * lenses + k] = draw.whole(0, 2) * 10.0;
     auto given_rotations = rotations, given_centres = draw.numbers(3 * size_t(cameras));
     // Positive semi-definite, as an inverse covariance is: weights of the single poses, and what poses share.
     const size_t numbers = 6 * size_t(cameras);
@@ -185,7 +186,7 @@ void bundle(Draw& draw) {
         for (size_t j = 0; j < numbers; ++j) given[i * numbers + j] += shared[i] * shared[j];
     FuzzRig rig(draw, cameras);
     const core::Bundle task = {rotations.data(),  translations.data(), focals.data(),    radials.data(),
-                               shifts.data(),     aspects.data(),      places.data(),    lens_of.data(),
+                               shifts.data(),     aspects.data(),      skews.data(),     places.data(),    lens_of.data(),
                                camera_of.data(),  first_of.data(),     pixels.data(),    means.data(),
                                information.data(), cameras,            lenses,           points,
                                draw.whole(-1, cameras - 1), draw.whole(1, 9) * 1.0,
@@ -195,7 +196,7 @@ void bundle(Draw& draw) {
                                rig.between.data(), rig.given_rotations.data(), rig.given_centres.data(),
                                rig.given.data(), rig.num_sets, rig.num_mounts};
     core_bundle_adjust(&task, draw.whole(0, 8), 1e-6);
-    const size_t size = 6 * size_t(cameras + lenses + rig.num_sets + rig.num_mounts);
+    const size_t size = 6 * size_t(cameras + rig.num_sets + rig.num_mounts) + 7 * size_t(lenses);
     std::vector<double> matrix(size * size);
     core_bundle_information(&task, matrix.data());
 }

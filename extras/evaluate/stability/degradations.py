@@ -493,6 +493,7 @@ KINDS: Mapping[str, AssumptionBreak] = {
 # Kinds that were made after all numbers were fitted, which no number is fitted to.
 
 _SHEARED = 0.05  # of the width: 30 ms of a pan by 100 degrees a second, where the picture spans 60
+_STRETCHED = 0.12  # of the logarithm of the height
 
 
 def _crop_to_squares(photos: Sequence[TrialImage], rng: np.random.Generator) -> list[TrialImage]:
@@ -530,6 +531,27 @@ def _shear_one(photos: Sequence[TrialImage], rng: np.random.Generator) -> list[T
     return _change_one(photos, rng, shear)
 
 
+def change_shape(photo: TrialImage, down: float = 1.0, shear: float = 0.0) -> TrialImage:
+    """Enlarged downwards by a factor, and sheared by `shear` pixels across for one down, about the middle."""
+    height, width = photo.image.shape[:2]
+    middle = np.array([[1.0, 0.0, width / 2], [0.0, 1.0, height / 2], [0.0, 0.0, 1.0]])
+    shape = np.array([[1.0, shear, 0.0], [0.0, down, 0.0], [0.0, 0.0, 1.0]])
+    return apply_homography(photo, middle @ shape @ np.linalg.inv(middle), f"shape{down:.4g},{shear:.4g}")
+
+
+def _stretch_one(photos: Sequence[TrialImage], rng: np.random.Generator) -> list[TrialImage]:
+    down = float(np.exp(rng.uniform(-_STRETCHED, _STRETCHED)))
+    return _change_one(photos, rng, lambda photo: change_shape(photo, down))
+
+
+def _stretch_all(photos: Sequence[TrialImage], rng: np.random.Generator) -> list[TrialImage]:
+    return [change_shape(photo, float(np.exp(rng.uniform(-_STRETCHED, _STRETCHED)))) for photo in photos]
+
+
+def _shear_all(photos: Sequence[TrialImage], rng: np.random.Generator) -> list[TrialImage]:
+    return [change_shape(photo, shear=float(rng.uniform(-_SHEARED, _SHEARED))) for photo in photos]
+
+
 LATER_KINDS: Mapping[str, AssumptionBreak] = {
     kind.name: kind
     for kind in (
@@ -540,6 +562,9 @@ LATER_KINDS: Mapping[str, AssumptionBreak] = {
         AssumptionBreak("each zoomed", _zoom_all),
         AssumptionBreak("one zoomed 1.5, aside", _zoom_one_aside),
         AssumptionBreak("one sheared", _shear_one),
+        AssumptionBreak("each sheared", _shear_all),
+        AssumptionBreak("one stretched", _stretch_one),
+        AssumptionBreak("each stretched", _stretch_all),
     )
 }
 

@@ -1,6 +1,7 @@
 """Rays to pixels and back, by every lens model; OpenCV says what is right."""
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,6 +14,8 @@ from splatnode.capture.lenses import project, unproject
 OPENCV = Intrinsics(640, 480, 500, 510, 322, 238, "calibration", (-0.2, 0.05, 0.001, -0.002, 0.01))
 FISHEYE = Intrinsics(640, 480, 210, 212, 322, 238, "calibration", (0.03, -0.01, 0.002, -0.0005), "fisheye")
 
+SKEWED = replace(OPENCV, skew=0.07)
+
 
 def rays(most_deg: float) -> np.ndarray:
     """(M, 3) of unit length, up to so far from the axis."""
@@ -21,11 +24,24 @@ def rays(most_deg: float) -> np.ndarray:
     return np.stack(parts, -1).reshape(-1, 3)
 
 
-@pytest.mark.parametrize(("lens", "most_deg"), [(OPENCV, 35), (FISHEYE, 100)], ids=["opencv", "fisheye"])
+@pytest.mark.parametrize(
+    ("lens", "most_deg"), [(OPENCV, 35), (SKEWED, 35), (FISHEYE, 100)], ids=["opencv", "skew", "fisheye"]
+)
 def test_there_and_back(lens, most_deg):
     given = rays(most_deg)
     pixels = project(5.0 * given, lens)
     assert np.isfinite(pixels).all() and np.allclose(unproject(pixels, lens), given, atol=1e-6)
+
+
+def test_a_skew_moves_rows_across_after_the_distortion():
+    given = rays(35)
+    plain = project(given, OPENCV)
+    y_distorted = (plain[:, 1] - OPENCV.cy) / OPENCV.fy
+    moved = plain + np.column_stack([OPENCV.fx * 0.07 * y_distorted, np.zeros(len(plain))])
+    assert np.allclose(project(given, SKEWED), moved, atol=1e-9)
+    pinhole = replace(SKEWED, distortion=())
+    by_K = given @ pinhole.K.T
+    assert np.allclose(project(given, pinhole), by_K[:, :2] / by_K[:, 2:], atol=1e-9)
 
 
 def test_a_fisheye_is_that_of_opencv():

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.lenses import undistort_frame
+from splatnode.capture.lenses import is_resampled, project, undistort_frame, unproject
 
 WIDTH, HEIGHT = 320, 240
 
@@ -55,6 +57,78 @@ def test_points_are_where_the_pinhole_says(given: Intrinsics):
     nearest = np.linalg.norm(found[:, None] - expected[inside], axis=2).min(0)
     assert inside.sum() >= 9
     assert nearest.max() < 0.6  # a dot's centre moves a little when its shape is stretched
+
+
+def smooth(pixels: np.ndarray) -> np.ndarray:
+    """(..., 3) uint8 colours of waves at pixels (..., 2) of the pinhole UPRIGHT."""
+    x, y = (pixels - (WIDTH / 2, HEIGHT / 2))[..., 0] / 9.0, (pixels - (WIDTH / 2, HEIGHT / 2))[..., 1] / 11.0
+    waves = np.stack([np.sin(x), np.cos(y), np.sin(x + y)], -1)
+    return (128 + 90 * waves).round().astype(np.uint8)
+
+
+UPRIGHT = Intrinsics(WIDTH, HEIGHT, 300.0, 300.0, 150.0, 125.0, "estimated")
+
+
+def shown_by(lens: Intrinsics) -> Frame:
+    """The waves as `lens` sees them; UPRIGHT sees them as they are."""
+    pixels = np.stack(np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5), -1).reshape(-1, 2)
+    image = smooth(project(unproject(pixels, lens), UPRIGHT)).reshape(HEIGHT, WIDTH, 3)
+    return Frame(0, "a.png", 0, image, lens)
+
+
+def sheared_by_hand(skew: float) -> Frame:
+    """The waves, sheared: each row is moved by as many pixels as the skew moves it, whatever the lens models say."""
+    columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    image = smooth(np.stack([columns - skew * (rows - UPRIGHT.cy), rows], -1))
+    return Frame(0, "a.png", 0, image, replace(UPRIGHT, skew=skew))
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        sheared_by_hand(0.05),
+        sheared_by_hand(-0.05),
+        shown_by(replace(UPRIGHT, skew=0.05, fy=320.0)),
+        shown_by(replace(UPRIGHT, skew=0.05, distortion=(-0.15, 0.02, 0.001, 0.0))),
+    ],
+    ids=["sheared", "other way", "and tall pixels", "and bent"],
+)
+def test_a_sheared_picture_becomes_upright(frame):
+    assert is_resampled(frame)
+    straight = undistort_frame(frame)
+    pinhole = straight.intrinsics
+    assert pinhole is not None and pinhole.fx == pinhole.fy
+    assert (pinhole.skew, pinhole.distortion, pinhole.source) == (0.0, (), "estimated")
+    pixels = np.stack(np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5), -1).reshape(-1, 2)
+    expected = smooth(project(unproject(pixels, pinhole), UPRIGHT)).reshape(HEIGHT, WIDTH, 3)
+    off = np.abs(straight.image.astype(float) - expected)[4:-4, 4:-4]
+    assert off.mean() < 0.6 and off.max() < 4
+    assert np.abs(frame.image.astype(float) - expected).mean() > 10  # it was sheared
+
+
+def test_no_corner_of_a_sheared_picture_is_invented():
+    lens = replace(UPRIGHT, skew=0.05)
+    pinhole = undistort_frame(sheared_by_hand(0.05)).intrinsics
+    assert pinhole is not None and pinhole.fx < 1.1 * UPRIGHT.fx
+    corners = np.array([[0.0, 0.0], [WIDTH, 0.0], [0.0, HEIGHT], [WIDTH, HEIGHT]])
+    there = project(unproject(corners, pinhole), lens)
+    assert (there > -0.01).all() and (there < np.array([WIDTH, HEIGHT]) + 0.01).all()
+
+
+def test_a_mask_goes_with_a_sheared_picture():
+    used = np.ones((HEIGHT, WIDTH), bool)
+    columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    used[columns - 0.05 * (rows - UPRIGHT.cy) < UPRIGHT.cx] = False  # left of an upright line, before the shear
+    straight = undistort_frame(replace(sheared_by_hand(0.05), mask=used))
+    assert straight.mask is not None and straight.intrinsics is not None
+    line = straight.intrinsics.cx
+    assert not straight.mask[:, : round(line) - 2].any() and straight.mask[:, round(line) + 3 :].all()
+
+
+def test_a_skew_that_leaves_no_rectangle_is_named():
+    lens = Intrinsics(HEIGHT, WIDTH, 300.0, 300.0, HEIGHT / 2, WIDTH / 2, "estimated", skew=0.9)
+    with pytest.raises(ValueError, match="a.png: without its skew of 0.9 the picture of 240 x 320 pixels has no"):
+        undistort_frame(Frame(0, "a.png", 0, np.zeros((WIDTH, HEIGHT, 3), np.uint8), lens))
 
 
 def test_no_corner_is_invented():

@@ -196,7 +196,7 @@ def test_a_principal_point_that_all_images_have_elsewhere_is_found():
 def test_tied_lenses_share_what_is_not_refuted():
     """The information of a tie is that of the difference of two parameters."""
     count = 3
-    sigmas = np.zeros((count, 6))
+    sigmas = np.zeros((count, 7))
     sigmas[1, 0] = 0.01
     prior = bundle_adjustment.LensPrior(
         np.zeros(count),
@@ -205,18 +205,18 @@ def test_tied_lenses_share_what_is_not_refuted():
         np.zeros(count),
         ties=bundle_adjustment.LensTies(np.array([-1, 0, -1]), sigmas),
     )
-    covariance = np.linalg.inv(prior.information[::6, ::6])
+    covariance = np.linalg.inv(prior.information[::7, ::7])
     apart = np.array([1.0, -1.0, 0.0])
     assert apart @ covariance @ apart == pytest.approx(0.01**2, rel=1e-3)
     assert covariance[2, 2] == pytest.approx(0.25)
     fixed = replace(prior, sigmas=np.array([0.0, 0.5, 0.5]))
     assert fixed.information[0, 0] == 0.0
-    assert fixed.information[6, 6] == pytest.approx(1 / 0.01**2 + 1 / 0.5**2)
+    assert fixed.information[7, 7] == pytest.approx(1 / 0.01**2 + 1 / 0.5**2)
 
 
 def test_a_group_has_the_covariance_of_common_and_own():
     count, own_sigma, common_sigma = 4, 0.02, 0.3
-    common = np.zeros((count, 6))
+    common = np.zeros((count, 7))
     common[:, 0] = common_sigma
     prior = bundle_adjustment.LensPrior(
         np.zeros(count),
@@ -225,14 +225,14 @@ def test_a_group_has_the_covariance_of_common_and_own():
         np.zeros(count),
         common=bundle_adjustment.CommonLensPrior(np.zeros(count, np.int64), common),
     )
-    covariance = np.linalg.inv(prior.information[::6, ::6])
+    covariance = np.linalg.inv(prior.information[::7, ::7])
     assert np.allclose(covariance, own_sigma**2 * np.eye(count) + common_sigma**2)
     assert prior.free[:, 0].all() and not prior.free[:, 1:].any()
 
 
 def test_a_group_of_which_nothing_but_its_common_part_is_open_has_an_information():
     """A sum of covariances that rounding makes singular ended the run."""
-    common = np.zeros((2, 6))
+    common = np.zeros((2, 7))
     common[:, 0] = 150.0
     prior = bundle_adjustment.LensPrior(
         np.zeros(2),
@@ -241,7 +241,7 @@ def test_a_group_of_which_nothing_but_its_common_part_is_open_has_an_information
         np.zeros(2),
         common=bundle_adjustment.CommonLensPrior(np.zeros(2, np.int64), common),
     )
-    information = prior.information[::6, ::6]
+    information = prior.information[::7, ::7]
     assert np.isfinite(information).all() and information[0, 1] == pytest.approx(-information[0, 0], rel=1e-6)
 
 

@@ -91,7 +91,8 @@ def test_the_covariances_are_in_the_frame_and_unit_of_the_world():
         points=turn(true.points),
     )
     keyframes = graph_of(4).keyframes
-    sure = self_calibration.OwnLensesConfig(focal_sigma=0.0, shift_sigma=0.0, radial_sigma=0.0)
+    nothing = dict.fromkeys(("focal_sigma", "shift_sigma", "radial_sigma", "own_aspect_sigma", "skew_sigma"), 0.0)
+    sure = self_calibration.OwnLensesConfig(**nothing)
     config = registration.RegistrationConfig(mapper=incremental_mapper.MapperConfig(own_lenses=sure))
     one, other = (
         make_registration(

@@ -164,7 +164,7 @@ def test_a_zoom_that_a_flat_scene_hides_moves_its_camera_no_farther_than_is_doub
 
 def test_where_depth_tells_the_lenses_little_is_doubted():
     deep, flat = (refit.doubt_common_lenses(given(made_up(depth=depth))) for depth in (3.0, 0.02))
-    assert deep.centre.max() < 0.2 * flat.centre.max() and deep.focals_rel.max() < 0.3 * flat.focals_rel.max()
+    assert deep.centre.max() < 0.2 * flat.centre.max() and deep.focals_rel.max() < 0.4 * flat.focals_rel.max()
 
 
 def test_a_keystone_correction_of_all_images_is_doubted_by_as_much_as_it_turns_them():
@@ -177,7 +177,7 @@ def test_a_keystone_correction_of_all_images_is_doubted_by_as_much_as_it_turns_t
     doubted, square = refit.doubt_common_lenses(shifted), refit.doubt_common_lenses(fit)
     assert error.max() > 2.0 and (truth == fit.Ts_world_camera).all()
     assert (error < 2.5 * 0.6 * doubted.rotation_deg).all()
-    assert square.rotation_deg.max() < 0.6 * doubted.rotation_deg.max()
+    assert square.rotation_deg.max() < 0.65 * doubted.rotation_deg.max()
 
 
 def test_a_lens_that_no_other_camera_shares_keeps_its_prior():

@@ -33,6 +33,7 @@ _USUAL: dict[str, tuple[Any, ...]] = {
     "height": (12,),
     "distortion": ([], [0.1], [0.1, 0.0, 0.0, 0.0]),
     "model": ("opencv", "opencv", "fisheye"),
+    "skew": (0.0,),
     "source": ("given", "calibration", "exif"),
     "metres": (0.1,),
     "down": ([0.0, 1.0, 0.0],),
