@@ -612,12 +612,12 @@ def give_own_lenses(
 def _choose_aspect(
     own: tuple[MapperInput, FinalModel], other: tuple[MapperInput, FinalModel], config: MapperConfig
 ) -> tuple[MapperInput, FinalModel]:
-    """The one of two models that explains the matches better; `other` was continued from pixels that are not square."""
+    """The one of two models that explains the matches better; `other` has pixels that are not square: rare ones."""
     if not self_calibration.is_stretched(other[1].model, config.own_lenses):
         return own
     before, after = (_median_error(problem, found.model) for problem, found in (own, other))
     simpler = len(other[0].lenses) < len(own[0].lenses)  # an aspect that does what several lenses do is no chance
-    if after < before / _AS_WELL if simpler else after < before * _AS_WELL:
+    if after < before / _AS_WELL if simpler else after < before * _NEARLY:
         return other
     if simpler and after < before / _NEARLY:
         prior = self_calibration.free_aspect_prior(own[1].model, config.own_lenses)

@@ -204,6 +204,7 @@ Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 _FOCAL, _RADIAL, _SHIFT, _ASPECT, _SKEW = 0, 1, slice(3, 5), 5, 6  # columns of the parameters of a lens
+_SHAPE = slice(5, 7)  # its aspect and skew
 _ROUNDS = 8  # of adjustments, each under the prior that the one before gave
 _OWN_SIGMA = 0.5  # of log focal, of a lens whose focal length was refuted
 _NEGLIGIBLE = 1e-6  # a sigma below it is 0
@@ -274,9 +275,10 @@ def free_lenses(
     groups, registered = partial.estimate.lens_of_camera, np.zeros(len(problem.views), bool)
     registered[list(partial.registered)] = True
     shared = np.bincount(groups[registered], minlength=len(partial.prior.sigmas)) > 1
-    floors = _narrowest_own(sides, config)
+    floors = _narrowest_own(sides, config, int(registered.sum()))
     widest = config.widest_focal, config.widest_shift, config.widest_radial
     own = _sigmas(*widest, sides, config.widest_aspect, config.widest_skew)
+    own[:, _SHAPE] = np.where(floors[:, _SHAPE] > 0, own[:, _SHAPE], 0.0)
     own[~shared[groups]] = 0.0  # of a lens with one view there is nothing to deviate from
     least = _least_common(partial.prior, groups, sides, config)
     common = np.maximum(least, _sigmas(0.0, config.widest_shift, 0.0, sides, config.widest_aspect))
@@ -345,7 +347,7 @@ def split_lenses(
     own = np.maximum(freed.prior.own_sigmas[views], np.abs(of_views))
     own[:, _FOCAL] = _OWN_SIGMA
     sides = np.array([problem.views[view].longer_side for view in views], np.float64)
-    floors = _narrowest_own(sides, config)
+    floors = _narrowest_own(sides, config, len(partial.registered))
     values, sigmas = np.concatenate([common, of_views]), np.concatenate([sigmas, own])
     estimate = replace(
         found,
@@ -425,7 +427,7 @@ def widen_lens_priors(
     """
     lenses = problem.lens_of_camera
     common = prior.own_sigmas[lenses]
-    floors = _narrowest_own(sides, config)
+    floors = _narrowest_own(sides, config, len(np.unique(problem.camera_of)))
     if prior.ties is None:
         groups, tied = lenses, floors
     else:
@@ -454,10 +456,14 @@ def expand_lenses(estimate: bundle_adjustment.Problem) -> bundle_adjustment.Prob
     )
 
 
-def _narrowest_own(sides: Array, config: OwnLensesConfig) -> Array:
-    """(C, 7) sigmas of the deviations of images that nothing tells to have a lens of their own."""
+def _narrowest_own(sides: Array, config: OwnLensesConfig, num_views: int) -> Array:
+    """(C, 7) sigmas of the deviations of images that nothing tells to have a lens of their own.
+
+    Two views alone tell nothing of a shape: each has that of its lens.
+    """
     lens = config.focal_sigma, config.shift_sigma, config.radial_sigma
-    return _sigmas(*lens, sides, config.own_aspect_sigma, config.skew_sigma)
+    shape = (config.own_aspect_sigma, config.skew_sigma) if num_views > 2 else (0.0, 0.0)
+    return _sigmas(*lens, sides, *shape)
 
 
 def _sigmas(focal: float, shift: float, radial: float, sides: Array, aspect: float = 0.0, skew: float = 0.0) -> Array:

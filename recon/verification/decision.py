@@ -243,6 +243,20 @@ def check_distortion(case: EvidenceCase) -> Verdict | None:
     return refuse(verification.DISTORTED, case.names, further=100 * found.corner_shift)
 
 
+def check_lenses(case: EvidenceCase) -> Verdict | None:
+    """Lenses of which nothing was told do not fit: with others the cameras explain the matches far better."""
+    if case.evidence.freed or case.evidence.own_lens_cost >= case.config.least_own_lens_cost:
+        return None
+    return refuse(verification.UNFIT_LENSES, case.names, percent=100 * (1.0 - case.evidence.own_lens_cost))
+
+
+def check_pair_of_lenses(case: EvidenceCase) -> Verdict | None:
+    """Two images through two unknown lenses: a focal length each and the pose fit any matches that have an epipole."""
+    if len(case.evidence.cameras) > 2 or case.evidence.unknown_lenses < 2:
+        return None
+    return refuse(verification.PAIR_OF_LENSES, case.names)
+
+
 def check_moving_plane(case: EvidenceCase) -> Verdict | None:
     """All that fits is one plane, and much does not fit with it: a flat thing that moves before what stands still."""
     evidence, config = case.evidence, case.config
@@ -714,6 +728,8 @@ WORDS = {  # what each field of the evidence says, for the user
     "travel": "how far the camera moved",
     "freed": "whether the given focal length is right",
     "distortion": "whether the lens bends the picture",
+    "unknown_lenses": "how many lenses are unknown",
+    "own_lens_cost": "whether the lenses that were found fit",
     "shifted_share": "whether pieces of the pictures only shifted",
 }
 
@@ -737,6 +753,8 @@ LIMITS = (  # each asks one piece of the evidence, and decides by itself
     check_given_lens,
     check_given_focal,
     check_distortion,
+    check_lenses,
+    check_pair_of_lenses,
     check_moving_plane,
     check_montage,
     check_weakest_link,

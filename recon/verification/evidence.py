@@ -393,6 +393,8 @@ class Evidence:
     travel: float  # RMS distance of the centres from their mean; the distance to the scene is 1
     freed: tuple[FreedLens, ...]  # lenses that came with the frames
     distortion: Distortion
+    unknown_lenses: int = 0  # lenses of which nothing but the images tells
+    own_lens_cost: float = 1.0  # robust cost with a lens for each camera, over that with the lenses that were found
     shifted_share: float = 0.0  # least share of two cameras' points that moved in a few pieces, as wholes
 
 
@@ -585,6 +587,8 @@ def verify(
         travel=refit.compute_travel(registration),
         freed=refit.free_lenses(fit),
         distortion=refit.measure_distortion(fit),
+        unknown_lenses=int(np.isnan(fit.given_focals).sum()),
+        own_lens_cost=refit.compute_own_lens_cost(fit),
         shifted_share=measure_shifted_share(graph.keyframes, registration),
     )
 

@@ -57,6 +57,12 @@ class BundleFit:
         """This fit adjusted: found once, for several sources of evidence begin there."""
         return replace(self, problem=bundle_adjustment.adjust(self.problem, self.prior, self.loss))
 
+    @cached_property
+    def apart(self) -> BundleFit:
+        """This fit adjusted with a lens for each camera, under wide priors."""
+        whole = self.minimum
+        return replace(whole, problem=_doubt_lenses(whole, FARTHEST_SHIFT)[0])
+
     @property
     def cost(self) -> float:
         """Robust cost of an observation, pixels squared; NaN where a camera or a lens is no longer a number.
@@ -532,16 +538,21 @@ def doubt_common_lenses(fit: BundleFit) -> CameraShifts:
     whole = adjust(fit)
     usual, prior = _doubt_lenses(whole, DOUBTED_SHIFT)
     covariance = bundle_adjustment.covariance(usual, prior, fit.loss, 0)
-    farthest, _ = _doubt_lenses(whole, FARTHEST_SHIFT)
-    mean = compute_camera_shifts(
-        replace(whole, problem=self_calibration.expand_lenses(whole.problem)), replace(whole, problem=farthest)
-    )
+    mean = compute_camera_shifts(replace(whole, problem=self_calibration.expand_lenses(whole.problem)), fit.apart)
     rotations, centres = bundle_adjustment.camera_sigmas(usual, covariance, range(len(whole.problem.rotations)))
     return CameraShifts(
         rotation_deg=np.hypot(ASKED_WEIGHT * mean.rotation_deg, rotations),
         centre=np.hypot(ASKED_WEIGHT * mean.centre, compute_rms_radius(whole.Ts_world_camera[:, :3, 3]) * centres),
         focals_rel=np.hypot(ASKED_WEIGHT * mean.focals_rel, bundle_adjustment.sigmas(covariance.log_focals)),
     )
+
+
+def compute_own_lens_cost(fit: BundleFit) -> float:
+    """Returns the robust cost with a lens for each camera over that with the lenses of the fit.
+
+    Right lenses leave others little to explain. What is far below was refuted, though no lens of an image was found.
+    """
+    return float(fit.apart.cost / max(adjust(fit).cost, MIN_COST))
 
 
 def _doubt_lenses(

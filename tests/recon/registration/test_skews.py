@@ -59,7 +59,8 @@ def test_a_bundle_finds_the_skew_of_a_lens(skew):
 
 @pytest.mark.numerical
 @pytest.mark.parametrize(
-    ("count", "number", "down", "shear"), [(3, 1, 1.08, 0.0), (3, 2, 1.0, 0.05), (4, 1, 1.0, -0.04), (4, 3, 0.95, 0.03)]
+    ("count", "number", "down", "shear"),
+    [(3, 1, 1.08, 0.0), (3, 1, 1.0, 0.05), (4, 1, 1.0, -0.04), (4, 3, 0.95, 0.03)],
 )
 def test_one_image_of_another_shape_is_right_within_its_bounds(count, number, down, shear):
     taken = photographs()[:count]

@@ -140,6 +140,17 @@ def test_a_lens_that_bends_the_picture():
     assert verdict(3, distortion=Distortion(0.02, 0.7)).code == Code.OK
 
 
+def test_lenses_that_others_fit_far_better_than_are_refused():
+    given = refused(verdict(3, own_lens_cost=0.3), Code.AMBIGUOUS)
+    assert "errors fall by 70 %" in given.message
+    assert verdict(3, own_lens_cost=0.45).code == Code.OK
+
+
+def test_two_images_of_two_unknown_lenses_are_refused():
+    refused(verdict(2, unknown_lenses=2), Code.FOCAL_SUSPECT)
+    assert verdict(2, unknown_lenses=1).publishable and verdict(3, unknown_lenses=3).code == Code.OK
+
+
 def test_two_places_that_almost_no_point_joins():
     link = WeakestLink(names(3, 4), shared_points=3, matches=180, inliers=150.0)
     given = refused(verdict(5, weakest_link=link), Code.SPLIT)

@@ -180,6 +180,14 @@ def test_a_keystone_correction_of_all_images_is_doubted_by_as_much_as_it_turns_t
     assert square.rotation_deg.max() < 0.65 * doubted.rotation_deg.max()
 
 
+def test_lenses_of_their_own_explain_little_of_right_ones_and_much_of_a_stretched_image():
+    fit = made_up()
+    stretched = fit.problem.pixels * np.where(fit.problem.camera_of == 1, 1.05, 1.0)[:, None] ** (0.0, 1.0)
+    changed = replace(fit, problem=replace(fit.problem, pixels=stretched))
+    assert refit.compute_own_lens_cost(fit) > 0.9
+    assert refit.compute_own_lens_cost(changed) < 0.4
+
+
 def test_a_lens_that_no_other_camera_shares_keeps_its_prior():
     """Four calibrated lenses, one a camera: nothing is doubted but what noise leaves open."""
     fit = made_up(depth=0.02)
