@@ -466,7 +466,7 @@ def _attempt_models(
         run.pause()
         partial = grow(problem, focals, first, config.incremental)
         if partial is not None:
-            yield _score_of(problem, partial, config), partial
+            yield score(problem, partial, config.score_px), partial
 
 
 def _finish_best(
@@ -539,7 +539,7 @@ def _try_lenses_of_views(
         return found
     zeros = {pair: config.score_px * float(problem.scale[pair[0]]) for pair in problem.pairs}
     alone = sum(count_explained(fit_epipolar_errors(problem.pairs[k], zeros[k]), zeros[k]) for k in zeros)
-    if alone * _AS_WELL <= _score_of(found[0], found[1].model, config):
+    if alone * _AS_WELL <= score(found[0], found[1].model, config.score_px):
         return found
     run.pause()
     apart = self_calibration.separate_views(problem)
@@ -560,7 +560,7 @@ def _choose_better(
     found: tuple[MapperInput, FinalModel], other: tuple[MapperInput, FinalModel], config: MapperConfig
 ) -> tuple[MapperInput, FinalModel]:
     """The other one of two models where it explains clearly more of the matches."""
-    before, after = (_score_of(each[0], each[1].model, config) for each in (found, other))
+    before, after = (score(each[0], each[1].model, config.score_px) for each in (found, other))
     return other if after * _AS_WELL > before else found
 
 
@@ -615,7 +615,7 @@ def _choose_aspect(
     """The one of two models that explains the matches better; `other` has pixels that are not square: rare ones."""
     if not self_calibration.is_stretched(other[1].model, config.own_lenses):
         return own
-    before, after = (_median_error(problem, found.model) for problem, found in (own, other))
+    before, after = (mapping_problem.compute_median_error(problem, found.model) for problem, found in (own, other))
     simpler = len(other[0].lenses) < len(own[0].lenses)  # an aspect that does what several lenses do is no chance
     if after < before / _AS_WELL if simpler else after < before * _NEARLY:
         return other
@@ -623,14 +623,6 @@ def _choose_aspect(
         prior = self_calibration.free_aspect_prior(own[1].model, config.own_lenses)
         return own[0], replace(own[1], model=replace(own[1].model, prior=prior))
     return own
-
-
-def _median_error(problem: MapperInput, partial: SparseModel) -> float:
-    """The median Sampson error of all matches, pixels at REFERENCE_SIDE; infinite are those of missing views."""
-    errors = mapping_problem.pair_errors(problem, partial)
-    return float(
-        np.median(np.concatenate([errors.get(k, np.full(len(p.matches), np.inf)) for k, p in problem.pairs.items()]))
-    )
 
 
 def _separate_lenses(
@@ -652,18 +644,32 @@ def _separate_lenses(
             found = search(problem, finished.model, images, config)
             if found is None:
                 continue
-            if _score_of(found[0], found[1].model, config) > _score_of(problem, finished.model, config):
+            if score(found[0], found[1].model, config.score_px) > score(problem, finished.model, config.score_px):
                 problem, finished = found
         searches = [_try_other_focals]
-        freed = self_calibration.free_lenses(problem, finished.model, finished.loss, config.own_lenses)
-        if freed.refuting_views.any() or freed.displaced.any():
-            apart, partial = self_calibration.split_lenses(problem, finished.model, freed, config.own_lenses)
-            again = run_final_adjustment(apart, partial, images, config.finishing)
-            if again is not None:
-                problem, finished = apart, again
+        problem, finished = _split_refuted_lenses(problem, finished, images, config)
         if finished is before:
             break
     return problem, finished
+
+
+def _split_refuted_lenses(
+    problem: MapperInput, finished: FinalModel, images: Sequence[PatchImage], config: MapperConfig
+) -> tuple[MapperInput, FinalModel]:
+    """Both, with own lenses for the views that refute theirs; of another shape where none without explains as much."""
+    found = problem, finished
+    for shapes in (False, True):
+        freed = self_calibration.free_lenses(problem, finished.model, finished.loss, config.own_lenses, shapes=shapes)
+        if not freed.refutes:
+            continue
+        apart, partial = self_calibration.split_lenses(problem, finished.model, freed, config.own_lenses)
+        again = run_final_adjustment(apart, partial, images, config.finishing)
+        if again is None:
+            continue
+        errors = [mapping_problem.compute_median_error(of, model.model) for of, model in ((apart, again), found)]
+        if found[1] is finished or errors[0] < _AS_WELL * errors[1]:
+            found = apart, again
+    return found
 
 
 def _find_doubtful_views(problem: MapperInput, partial: SparseModel, config: MapperConfig) -> list[int]:
@@ -684,7 +690,7 @@ def _try_coarse_lenses(
     noise_px = scale * _COARSE_PX * float(np.sqrt(config.finishing.correlated))
     loss = bundle_adjustment.BundleAdjustmentConfig(robust_px=scale * _COARSE_ROBUST_PX, noise_px=noise_px)
     freed = self_calibration.free_lenses(problem, partial, loss, config.own_lenses, config.incremental.triangulation)
-    if not (freed.refuting_views.any() or freed.displaced.any()):
+    if not freed.refutes:
         return None
     problem, partial = self_calibration.split_lenses(problem, partial, freed, config.own_lenses)
     return _finish_model(problem, partial, images, config)
@@ -745,10 +751,6 @@ def _is_same_lens(problem: MapperInput, finished: FinalModel, view: int, common:
     return bool(
         view in finished.model.registered and same_focal and apart_px < _SAME_LENS * problem.views[view].longer_side
     )
-
-
-def _score_of(problem: MapperInput, partial: SparseModel, config: MapperConfig) -> float:
-    return score(problem, partial, config.score_px)
 
 
 def _is_same_model(one: SparseModel, other: SparseModel, config: MapperConfig) -> bool:

@@ -459,6 +459,14 @@ def pair_errors(problem: MapperInput, partial: SparseModel) -> dict[Pair, Array]
     }
 
 
+def compute_median_error(problem: MapperInput, partial: SparseModel) -> float:
+    """Returns the median Sampson error of all matches, pixels at REFERENCE_SIDE; missing views count as infinite."""
+    errors = pair_errors(problem, partial)
+    return float(
+        np.median(np.concatenate([errors.get(k, np.full(len(p.matches), np.inf)) for k, p in problem.pairs.items()]))
+    )
+
+
 def inlier_ratios(problem: MapperInput, partial: SparseModel, max_error_px: float) -> dict[Pair, float]:
     """The share of each pair's matches with Sampson errors below `max_error_px`, pixels at REFERENCE_SIDE."""
     return {pair: float((errors < max_error_px).mean()) for pair, errors in pair_errors(problem, partial).items()}

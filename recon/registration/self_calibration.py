@@ -254,6 +254,11 @@ class PerViewLensModel:
     displaced: Flags  # (C,) views of groups whose common principal point or aspect is not what it was taken for
 
     @property
+    def refutes(self) -> bool:
+        """Whether a view refutes the common lens, or a group that its lens is what it was taken for."""
+        return bool(self.refuting_views.any() or self.displaced.any())
+
+    @property
     def refuting_views(self) -> Flags:
         """(C,) views that refute the common lens."""
         return np.asarray(self.stays.any(axis=1))
@@ -265,8 +270,11 @@ def free_lenses(
     loss: bundle_adjustment.BundleAdjustmentConfig,
     config: OwnLensesConfig,
     coarse: multiview_geometry.TriangulationConfig | None = None,
+    shapes: bool = True,
 ) -> PerViewLensModel:
     """The model adjusted with a lens for each view, and which views refute that theirs is common.
+
+    With `shapes` each view may have an aspect and a skew of its own, too.
 
     `loss` has the noise of an observation, by which deviations are weighed. With `coarse` points are triangulated anew
     before each adjustment, with large errors allowed: a model that a wrong common lens has bent lacks those that tell.
@@ -278,7 +286,7 @@ def free_lenses(
     floors = _narrowest_own(sides, config, int(registered.sum()))
     widest = config.widest_focal, config.widest_shift, config.widest_radial
     own = _sigmas(*widest, sides, config.widest_aspect, config.widest_skew)
-    own[:, _SHAPE] = np.where(floors[:, _SHAPE] > 0, own[:, _SHAPE], 0.0)
+    own[:, _SHAPE] = np.where(shapes & (floors[:, _SHAPE] > 0), own[:, _SHAPE], 0.0)
     own[~shared[groups]] = 0.0  # of a lens with one view there is nothing to deviate from
     least = _least_common(partial.prior, groups, sides, config)
     common = np.maximum(least, _sigmas(0.0, config.widest_shift, 0.0, sides, config.widest_aspect))

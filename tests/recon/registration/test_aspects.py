@@ -93,7 +93,7 @@ def finished(taken: Photographed, num_lenses: int, aspect: float) -> tuple[Mappe
 def test_of_two_explanations_the_better_or_simpler_one_is_kept(monkeypatch, lenses, ratio, kept):
     own, other = finished(photographed(3), lenses, 1.0), finished(photographed(3), 1, 1.2)
     errors = {id(own[1].model): 1.0, id(other[1].model): ratio}
-    monkeypatch.setattr(incremental_mapper, "_median_error", lambda _, partial: errors[id(partial)])
+    monkeypatch.setattr(mapping_problem, "compute_median_error", lambda _, partial: errors[id(partial)])
     chosen = incremental_mapper._choose_aspect(own, other, CONFIG)
     if kept != "unknown":
         assert chosen is (own if kept == "own" else other)

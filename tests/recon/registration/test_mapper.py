@@ -426,7 +426,7 @@ def test_a_lens_of_its_own_that_comes_out_as_the_common_one_is_none(taken, pairs
     tried = OwnLens(1.07 * FOCAL, np.array([0.0, 0.07 * max(SIZE)]))
     monkeypatch.setattr(incremental_mapper, "_find_doubtful_views", lambda *_: [2])
     monkeypatch.setattr(mapping_problem, "find_own_lens", lambda *_: tried)
-    monkeypatch.setattr(incremental_mapper, "_score_of", lambda problem, *_: float(len(problem.lenses)))
+    monkeypatch.setattr(incremental_mapper, "score", lambda problem, *_: float(len(problem.lenses)))
     found = incremental_mapper.build_model(views, [Lens((FOCAL,), 0.3)], pairs, incremental_mapper.MapperConfig())
     assert found is not None
     focals = np.exp(found.estimate.log_focals[found.estimate.lens_of_camera])
