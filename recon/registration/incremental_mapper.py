@@ -368,12 +368,10 @@ _MAX_DOUBTED = 8  # views for which other focal lengths are tried at once
 _SAME_LENS = 0.01
 _DOUBTED_RATIO = 0.9  # inlier ratio of a view below which other focal lengths are tried for it
 _COARSE_PX, _COARSE_ROBUST_PX = 1.0, 4.0  # noise and scale of the robust loss of a coarse search, at REFERENCE_SIDE
-# Of two models, the median error of the matches of the better one over that of the other, from which on they explain
-# them as well as each other, and nearly so
+# Ratio of the median errors of two models, from which on they explain the matches as well as each other, and nearly so
 _AS_WELL, _NEARLY = 0.97, 0.9
 # Difference of log focals from which on a lens is far from a typical one, and from what its pairs vote for
-_FAR_FROM_TYPICAL = 0.5
-_FAR_FROM_VOTE = 0.3
+_FAR_FROM_TYPICAL, _FAR_FROM_VOTE = 0.5, 0.3
 _HELD_SIGMA = 0.15  # of log focal, while such a focal length is held
 _OTHER_ATTEMPTS = 3  # first pairs that are tried with it, or with a lens for each view
 _APART = 0.1  # difference of log focals from which on views have a lens each
@@ -657,19 +655,21 @@ def _split_refuted_lenses(
     problem: MapperInput, finished: FinalModel, images: Sequence[PatchImage], config: MapperConfig
 ) -> tuple[MapperInput, FinalModel]:
     """Both, with own lenses for the views that refute theirs; of another shape where none without explains as much."""
-    found = problem, finished
-    for shapes in (False, True):
+    found, num_views = (problem, finished), len(finished.model.registered)
+    for shapes in (False, True) if num_views >= self_calibration.FEWEST_FOR_SHAPES else (False,):
         freed = self_calibration.free_lenses(problem, finished.model, finished.loss, config.own_lenses, shapes=shapes)
         if not freed.refutes:
             continue
         apart, partial = self_calibration.split_lenses(problem, finished.model, freed, config.own_lenses)
         again = run_final_adjustment(apart, partial, images, config.finishing)
-        if again is None:
-            continue
-        errors = [mapping_problem.compute_median_error(of, model.model) for of, model in ((apart, again), found)]
-        if found[1] is finished or errors[0] < _AS_WELL * errors[1]:
+        if again is not None and (found[1] is finished or _has_smaller_errors((apart, again), found)):
             found = apart, again
     return found
+
+
+def _has_smaller_errors(one: tuple[MapperInput, FinalModel], other: tuple[MapperInput, FinalModel]) -> bool:
+    errors = [mapping_problem.compute_median_error(problem, found.model) for problem, found in (one, other)]
+    return errors[0] < _AS_WELL * errors[1]
 
 
 def _find_doubtful_views(problem: MapperInput, partial: SparseModel, config: MapperConfig) -> list[int]:

@@ -205,6 +205,7 @@ Flags = npt.NDArray[np.bool_]
 
 _FOCAL, _RADIAL, _SHIFT, _ASPECT, _SKEW = 0, 1, slice(3, 5), 5, 6  # columns of the parameters of a lens
 _SHAPE = slice(5, 7)  # its aspect and skew
+FEWEST_FOR_SHAPES = 3  # views, of which each may have an aspect and a skew of its own
 _ROUNDS = 8  # of adjustments, each under the prior that the one before gave
 _OWN_SIGMA = 0.5  # of log focal, of a lens whose focal length was refuted
 _NEGLIGIBLE = 1e-6  # a sigma below it is 0
@@ -467,10 +468,10 @@ def expand_lenses(estimate: bundle_adjustment.Problem) -> bundle_adjustment.Prob
 def _narrowest_own(sides: Array, config: OwnLensesConfig, num_views: int) -> Array:
     """(C, 7) sigmas of the deviations of images that nothing tells to have a lens of their own.
 
-    Two views alone tell nothing of a shape: each has that of its lens.
+    Fewer than FEWEST_FOR_SHAPES views tell nothing of a shape: each has that of its lens.
     """
     lens = config.focal_sigma, config.shift_sigma, config.radial_sigma
-    shape = (config.own_aspect_sigma, config.skew_sigma) if num_views > 2 else (0.0, 0.0)
+    shape = (config.own_aspect_sigma, config.skew_sigma) if num_views >= FEWEST_FOR_SHAPES else (0.0, 0.0)
     return _sigmas(*lens, sides, *shape)
 
 

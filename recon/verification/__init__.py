@@ -257,7 +257,7 @@ UNFIT_LENS = Refusal(
 )
 PAIR_OF_LENSES = Refusal(
     Code.FOCAL_SUSPECT,
-    "Two photographs of different lenses fit with wrong focal lengths, too, and nothing can tell.",
+    "Two photographs through different unknown lenses fit wrong focal lengths as well as right ones.",
     "Add a third photograph, or give the lens of one by --intrinsics.",
 )
 UNFIT_LENSES = Refusal(
